@@ -35,16 +35,12 @@ OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)  # Green of other objects on the table
 class Recorder(Watcher):
     """Keeps what a scene looks like, and the plan that is carried out in it."""
 
-    rate: float = RATE
-    """Pictures a second."""
+    rate: float = RATE  # Pictures a second
     frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
-        default_factory=list)
-    """Arm, hand [rad or m], and the objects' poses [m]."""
-    objects: tuple[ObjectModel, ...] = ()
-    """The objects in the scene, the one that is asked for first."""
+        default_factory=list)  # Arm, hand [rad or m], and the objects' poses [m]
+    objects: tuple[ObjectModel, ...] = ()  # The objects in the scene, the one that is asked for first
     plan: MotionPlan | None = None
-    next_time: float | None = None
-    """Simulated time of the next frame [s]."""
+    next_time: float | None = None  # Simulated time of the next frame [s]
 
     def planned(self, seen: PickedObject, made: MotionPlan) -> None:
         """Keep the plan."""

@@ -149,13 +149,10 @@ class Task:
     """One object to lift."""
 
     cell: Workcell
-    obj: ObjectModel
-    """With a frame whose z axis points up."""
-    T: Float[np.ndarray, "4 4"]
-    """Where it stands in the world [m]."""
+    obj: ObjectModel  # With a frame whose z axis points up
+    T: Float[np.ndarray, "4 4"]  # Where it stands in the world [m]
     config: PlanConfig
-    constraints: Constraints
-    """Without the scene to avoid, which the cell has."""
+    constraints: Constraints  # Without the scene to avoid, which the cell has
     seed: int
 
     @staticmethod
@@ -224,18 +221,13 @@ class Tries:
     """What became of the grasps so far, by their number, in the order in which they were made."""
 
     parts: list[GraspBatch] = field(default_factory=list)
-    waiting: list[int] = field(default_factory=list)
-    """Not tried yet, in the order of trying."""
+    waiting: list[int] = field(default_factory=list)  # Not tried yet, in the order of trying
     ready: list[Feasible] = field(default_factory=list)
     """Left over from the last batch: they can be carried out, but were not trusted."""
-    found: dict[int, Feasible] = field(default_factory=dict)
-    """Can be carried out."""
-    share: dict[int, float] = field(default_factory=dict)
-    """Share of the rehearsals in which a grasp holds the object."""
-    lost: list[Feasible] = field(default_factory=list)
-    """Can be carried out, but lose the object when rehearsed."""
-    dropped: dict[int, str] = field(default_factory=dict)
-    """Why."""
+    found: dict[int, Feasible] = field(default_factory=dict)  # Can be carried out
+    share: dict[int, float] = field(default_factory=dict)  # Share of the rehearsals in which a grasp holds the object
+    lost: list[Feasible] = field(default_factory=list)  # Can be carried out, but lose the object when rehearsed
+    dropped: dict[int, str] = field(default_factory=dict)  # Why
     watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
 
     @property

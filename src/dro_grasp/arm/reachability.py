@@ -74,20 +74,16 @@ class ReachConfig(Checked):
 class Feasible:
     """A grasp with the arm's configurations for it."""
 
-    index: int
-    """Of the grasp in its batch."""
-    approach: Float[np.ndarray, "k n_arm"]
-    """From the standoff to the grasp [rad or m]."""
-    lift: Float[np.ndarray, "m n_arm"]
-    """From the grasp upwards [rad or m]."""
+    index: int  # Of the grasp in its batch
+    approach: Float[np.ndarray, "k n_arm"]  # From the standoff to the grasp [rad or m]
+    lift: Float[np.ndarray, "m n_arm"]  # From the grasp upwards [rad or m]
 
 
 @dataclass(frozen=True)
 class Postures:
     """Independent joints of the hand in one grasp [rad or m]."""
 
-    opened: Float[np.ndarray, " n_dof"]
-    """While the arm travels."""
+    opened: Float[np.ndarray, " n_dof"]  # While the arm travels
     pregrasp: Float[np.ndarray, " n_dof"]
     grasp: Float[np.ndarray, " n_dof"]
     squeeze: Float[np.ndarray, " n_dof"]

@@ -31,12 +31,9 @@ FEWEST = 60  # Fewest points of an object (ours)
 class Sight:
     """What a camera sees on a table."""
 
-    points: Float[np.ndarray, "n 3"]
-    """Points of the object that is wanted, in the frame in which they were given [m]."""
-    others: Float[np.ndarray, "m 3"]
-    """Points of other things on the table, in the world [m]."""
-    table_height: float
-    """Height of the fitted plane in the middle of the table [m]."""
+    points: Float[np.ndarray, "n 3"]  # Points of the object that is wanted, in the frame in which they were given [m]
+    others: Float[np.ndarray, "m 3"]  # Points of other things on the table, in the world [m]
+    table_height: float  # Height of the fitted plane in the middle of the table [m]
     places: Float[np.ndarray, "k 2"]
     """Where things stand on the table, the one with most points first: x and y in the world [m]."""
 

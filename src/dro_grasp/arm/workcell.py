@@ -54,8 +54,7 @@ class Contact:
 
     first: str
     second: str
-    distance: float
-    """Negative where they penetrate [m]."""
+    distance: float  # Negative where they penetrate [m]
 
     @property
     def depth(self) -> str:

@@ -27,16 +27,13 @@ class Import:
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """`cmap_dataset.pt` of the official D(R,O) release, or npy files of DexGraspNet or DexGraspBench."""
-    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
-    """Format of the files."""
-    output: Path
-    """Folder for one grasp file per hand; created if missing."""
+    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]  # Format of the files.
+    output: Path  # Folder for one grasp file per hand; created if missing.
     hands: tuple[str, ...] = ()
     """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Object of all grasps, if the file names another or none."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Read all files, find hands and objects, write grasp files."""
@@ -71,10 +68,8 @@ class Import:
 class Info:
     """Count the grasps of a data set by hand and object."""
 
-    folder: tyro.conf.Positional[Path]
-    """An output folder of `dro-grasp synthesize`, a folder of grasp files, or a grasp file."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    folder: tyro.conf.Positional[Path]  # An output folder of `dro-grasp synthesize`, a folder of grasp files, or a grasp file.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Count."""
@@ -110,10 +105,8 @@ class Report(DataSets):
     Example: dro-grasp dataset report data --output report.html
     """
 
-    output: Annotated[Path | None, optional("PATH", "no page")] = None
-    """Self-contained HTML page with charts and pictures."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    output: Annotated[Path | None, optional("PATH", "no page")] = None  # Self-contained HTML page with charts and pictures.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Measure, print, write the page."""
@@ -144,12 +137,10 @@ class Merge(DataSets):
     Example: dro-grasp dataset merge data more --output grasps --per-pair 150
     """
 
-    output: Path
-    """Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end."""
+    output: Path  # Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Merge, and write the files."""
@@ -178,18 +169,12 @@ class Check(DataSets):
     Example: dro-grasp dataset check data --sample 500
     """
 
-    sample: int = 100
-    """Grasps to evaluate, drawn uniformly from all grasps."""
-    protocol: ProtocolName = "strict"
-    """Protocol of the trial."""
-    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
-    """Friction coefficient between hand and object."""
-    mass_factor: float = 1.0
-    """Factor for the masses of the objects, and thereby for the forces."""
-    seed: int = 0
-    """Seed of the sample."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    sample: int = 100  # Grasps to evaluate, drawn uniformly from all grasps.
+    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
+    mass_factor: float = 1.0  # Factor for the masses of the objects, and thereby for the forces.
+    seed: int = 0  # Seed of the sample.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Draw, evaluate, compare."""
@@ -221,16 +206,11 @@ class Filter(DataSets):
     Example: dro-grasp dataset filter theirs.parquet --protocol strict --output kept
     """
 
-    output: Path
-    """Folder for the files, one per hand; created if missing."""
-    protocol: ProtocolName = "strict"
-    """Protocol of the trial."""
-    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
-    """Friction coefficient between hand and object."""
-    close_fingers: Flag = False
-    """Close idle fingers onto the object where the grasp still passes."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    output: Path  # Folder for the files, one per hand; created if missing.
+    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
+    close_fingers: Flag = False  # Close idle fingers onto the object where the grasp still passes.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Evaluate, and write one file per hand."""
@@ -266,19 +246,16 @@ class BundleCommand(DataSets):
     Example: dro-grasp dataset bundle data --output bundle.safetensors
     """
 
-    output: Path
-    """Bundle to write (.safetensors)."""
+    output: Path  # Bundle to write (.safetensors).
     split: Literal["train", "few_shot", "validate"] = "train"
     """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on objects that no
     weights are trained on, for measuring."""
-    hands: tuple[str, ...] = ()
-    """Hands to include; by default all."""
+    hands: tuple[str, ...] = ()  # Hands to include; by default all.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     hands_without_grasps: tuple[str, ...] = ()
     """Names or URDF files of further hands, such as those of `hand make`: `pretrain` needs their kinematics alone."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Select the grasps of the split, find their hands and objects, write the bundle."""

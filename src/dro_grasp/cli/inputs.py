@@ -54,5 +54,4 @@ class ConstraintOptions(PalmOptions):
 
     hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
     """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
-    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
-    """Balls [m] that the hand stays out of."""
+    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()  # Balls [m] that the hand stays out of.

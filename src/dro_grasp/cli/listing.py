@@ -12,8 +12,7 @@ from dro_grasp.cli.output import print_result
 class Hands:
     """List hands by name. Any URDF or MJCF file works as well."""
 
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Print names and their sources."""
@@ -29,8 +28,7 @@ class Hands:
 class Objects:
     """List objects by name. Any mesh or point cloud file works as well."""
 
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Print names and splits."""

@@ -19,26 +19,20 @@ class Serve:
     Example: dro-grasp serve --hand my_hand.urdf --port 8090
     """
 
-    hand: tuple[str, ...] = ()
-    """Names or files of hands that are loaded at once; built-in ones can be asked for besides."""
+    hand: tuple[str, ...] = ()  # Names or files of hands that are loaded at once; built-in ones can be asked for besides.
     object: tuple[str, ...] = ()
     """Files or folders of objects that can be asked for by their names; built-in ones, and what is sent, can be besides."""
     host: str = "127.0.0.1"
     """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network and needs a token."""
-    port: int = 8090
-    """Port to serve on."""
+    port: int = 8090  # Port to serve on.
     token: Annotated[str | None, optional("TOKEN", "DRO_GRASP_TOKEN, or none")] = None
     """What requests must bear: the header `Authorization: Bearer TOKEN`."""
-    queue: int = 16
-    """Requests that may wait; more are refused."""
-    time_limit: float = 60.0
-    """A request that is computed for longer is ended [s]."""
-    megabytes: float = 32.0
-    """Largest request [MB]."""
+    queue: int = 16  # Requests that may wait; more are refused.
+    time_limit: float = 60.0  # A request that is computed for longer is ended [s].
+    megabytes: float = 32.0  # Largest request [MB].
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights or the path of a weights file."""
-    device: str = "cpu"
-    """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
+    device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
 
     def run(self) -> int:
         """Check, load, and serve until Ctrl-C or SIGTERM."""

@@ -25,39 +25,28 @@ class Synthesize:
     Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output data
     """
 
-    hand: tuple[str, ...]
-    """Names or paths of hands."""
-    object: tuple[str, ...]
-    """Names, meshes, folders of meshes, or groups such as builtin:train and assets:validate."""
-    output: Path
-    """Folder for the grasp files; created if missing."""
-    grasps: int = 150
-    """Valid grasps of each hand on each object. A rerun with a larger number adds the difference."""
+    hand: tuple[str, ...]  # Names or paths of hands.
+    object: tuple[str, ...]  # Names, meshes, folders of meshes, or groups such as builtin:train and assets:validate.
+    output: Path  # Folder for the grasp files; created if missing.
+    grasps: int = 150  # Valid grasps of each hand on each object. A rerun with a larger number adds the difference.
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Start no new work after this time [min]. A rerun resumes."""
-    workers: int = 2
-    """Processes of one thread each. A running Ray cluster uses all its CPUs instead."""
+    workers: int = 2  # Processes of one thread each. A running Ray cluster uses all its CPUs instead.
     shard: Annotated[str, tyro.conf.arg(metavar="I/N", help_behavior_hint="(default: 1/1, all of them)")] = "1/1"
     """Part of the pairs that this run fills: 3/16 is the third of sixteen. All parts may share the folder and run at once, as
     the tasks of an array job."""
-    engine: Literal["local", "ray"] = "local"
-    """Processes on this machine, or a Ray cluster."""
+    engine: Literal["local", "ray"] = "local"  # Processes on this machine, or a Ray cluster.
     ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
     """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
-    device: str = "cpu"
-    """Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
-    scale: float = 1.0
-    """Factor for the coordinates of the objects: 0.001 for millimetres."""
-    seed: int = 0
-    """The same seed gives the same grasps."""
-    protocol: ProtocolName = "strict"
-    """Protocol of the trial that grasps must pass."""
+    device: str = "cpu"  # Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
+    scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
+    seed: int = 0  # The same seed gives the same grasps.
+    protocol: ProtocolName = "strict"  # Protocol of the trial that grasps must pass.
     idle: float = 0.6
     """Probability that a finger other than the thumb is not asked to touch, 0 to 1; lower makes fuller grasps, and fewer."""
     keep_idle_fingers: Flag = False
     """Leave idle fingers as they are. Otherwise they close onto the object where the grasp then passes as well."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""

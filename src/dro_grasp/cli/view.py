@@ -38,20 +38,15 @@ class View:
     """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to show first: a name in the file, or a mesh to use for the file's only object; without a file, any object."""
-    scale: float = 1.0
-    """Factor for the coordinates of the mesh given with --object."""
-    port: int = 8080
-    """Port to serve on; if it is taken, the next free one."""
-    host: str = "127.0.0.1"
-    """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network."""
-    attempt: int = 0
-    """Which of the attempts in the file to run once more and show first."""
+    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
+    port: int = 8080  # Port to serve on; if it is taken, the next free one.
+    host: str = "127.0.0.1"  # Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network.
+    attempt: int = 0  # Which of the attempts in the file to run once more and show first.
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Robot to use instead of the one named in a plan or an attempt."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights, or the attempts' own")] = None
     """Weights for grasps generated on the page, or to use instead of those that attempts were made with."""
-    device: str = "cpu"
-    """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
+    device: str = "cpu"  # Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1.
 
     def run(self) -> int:
         """Serve the page, with the grasps of the file if there is one."""
@@ -116,30 +111,20 @@ class Picture:
     Example: dro-grasp picture grasps.parquet --output sheet.png --opacity 0.5 --contacts
     """
 
-    file: tyro.conf.Positional[Path]
-    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
-    output: Path
-    """PNG file to write."""
-    count: int = 16
-    """Limit of grasps drawn, from the first on."""
-    columns: int = 4
-    """Pictures side by side."""
-    size: tuple[int, int] = (320, 280)
-    """Width and height of one picture [pixels], at most 4096 each."""
-    opacity: float = 1.0
-    """Opacity of the object; below 1 the hand shows through it."""
-    contacts: Flag = False
-    """Mark contacts in red."""
+    file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.
+    output: Path  # PNG file to write.
+    count: int = 16  # Limit of grasps drawn, from the first on.
+    columns: int = 4  # Pictures side by side.
+    size: tuple[int, int] = (320, 280)  # Width and height of one picture [pixels], at most 4096 each.
+    opacity: float = 1.0  # Opacity of the object; below 1 the hand shows through it.
+    contacts: Flag = False  # Mark contacts in red.
     posture: Literal["held", "grasp"] = "held"
     """Draw hand and object after the hand has closed, or the grasp from which it closes."""
-    only_successful: Flag = False
-    """Draw only grasps that passed their trial."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one named in the file."""
+    only_successful: Flag = False  # Draw only grasps that passed their trial.
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "every object in the file")] = None
     """Object to draw: a name in the file, or a mesh to use for the file's only object. Several objects share the sheet."""
-    scale: float = 1.0
-    """Factor for the coordinates of the mesh given with --object."""
+    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
 
     def run(self) -> int:
         """Load the file and draw."""

@@ -16,8 +16,7 @@ from dro_grasp.cli.output import print_json, print_result, say
 class List:
     """List the shipped weights with size, training data and checksum."""
 
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Print the metadata of each file."""
@@ -39,8 +38,7 @@ class Verify:
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Names of shipped weights, or paths of weights files; by default all shipped weights. The checksums are printed."""
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Check all files, then report; the exit code is 2 if one is damaged."""

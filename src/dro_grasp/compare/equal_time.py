@@ -27,12 +27,9 @@ SMALLEST_ROUND = 0.1  # A method goes on if this share of the candidates that it
 class Returned:
     """What a method returns."""
 
-    grasps: GraspBatch
-    """The best by score, best first."""
-    candidates: int
-    """Grasps made, of which these are the best."""
-    seconds: float
-    """CPU time of all of them [s]."""
+    grasps: GraspBatch  # The best by score, best first
+    candidates: int  # Grasps made, of which these are the best
+    seconds: float  # CPU time of all of them [s]
 
 
 def equal_time(

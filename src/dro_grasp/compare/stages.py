@@ -51,22 +51,14 @@ class BenchmarkConfig(Checked):
 
     num: int = 100
     """Grasps of each hand on each object, before ranking; RETURNED and EQUAL_TIME return as many as ranking keeps of them."""
-    stages: tuple[str, ...] = STAGES
-    """Which of STAGES, RETURNED and EQUAL_TIME."""
-    protocols: tuple[Protocol, ...] = ()
-    """Trials of every grasp."""
-    view: View = "whole"
-    """What methods, refinement and ranking see of the object; trials are on all of it."""
-    views: int = 1
-    """Views of each object for each hand, with other random numbers and `num` grasps each."""
-    seed: int = 0
-    """Of all grasps and views; each pair's seeds are derived from it."""
-    workers: int | None = None
-    """Threads of the trials; all cores by default."""
-    device: str = "cpu"
-    """Where the grasp energy is computed."""
-    contact_quality: bool = False
-    """Whether contacts are measured too, as DexGraspBench does."""
+    stages: tuple[str, ...] = STAGES  # Which of STAGES, RETURNED and EQUAL_TIME
+    protocols: tuple[Protocol, ...] = ()  # Trials of every grasp
+    view: View = "whole"  # What methods, refinement and ranking see of the object; trials are on all of it
+    views: int = 1  # Views of each object for each hand, with other random numbers and `num` grasps each
+    seed: int = 0  # Of all grasps and views; each pair's seeds are derived from it
+    workers: int | None = None  # Threads of the trials; all cores by default
+    device: str = "cpu"  # Where the grasp energy is computed
+    contact_quality: bool = False  # Whether contacts are measured too, as DexGraspBench does
 
 
 def benchmark(

@@ -48,10 +48,8 @@ MAX_CANDIDATES = 1_000  # Most candidates of one request (ours): a server answer
 class ServerConfig:
     """What a server computes with."""
 
-    weights: str | None = None
-    """Name of shipped weights or path of a weights file; None takes the default."""
-    device: str = "cpu"
-    """Where the network and the energies run."""
+    weights: str | None = None  # Name of shipped weights or path of a weights file; None takes the default
+    device: str = "cpu"  # Where the network and the energies run
     hands: tuple[str, ...] = ()
     """Names or files of hands that are loaded before serving; built-in ones can be asked for besides."""
     objects: tuple[str, ...] = ()

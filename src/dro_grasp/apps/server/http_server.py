@@ -34,12 +34,9 @@ MAX_CONNECTIONS = 128  # Most open connections (ours)
 class Access:
     """Who may ask, and how much at once."""
 
-    host: str = "127.0.0.1"
-    """Address to serve at; only this machine can connect by default."""
-    token: str | None = None
-    """What requests must bear; needed where others can connect."""
-    megabytes: float = 32.0
-    """Largest body of a request [MB]."""
+    host: str = "127.0.0.1"  # Address to serve at; only this machine can connect by default
+    token: str | None = None  # What requests must bear; needed where others can connect
+    megabytes: float = 32.0  # Largest body of a request [MB]
 
     def __post_init__(self) -> None:
         if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:

@@ -56,10 +56,8 @@ class Cancelled(Exception):
 class Computer:
     """What the process keeps from one request to the next, and does there."""
 
-    answerer: Any
-    """Answers the requests."""
-    cancelled: Any
-    """Number of the request that was cancelled last, in memory that the server's process writes."""
+    answerer: Any  # Answers the requests
+    cancelled: Any  # Number of the request that was cancelled last, in memory that the server's process writes
 
     @classmethod
     def prepare(cls, cancelled: Any) -> None:
@@ -93,17 +91,12 @@ class Computer:
 class Request:
     """A request on its way."""
 
-    call: Any
-    """A GraspCall."""
-    number: int
-    """Of all requests."""
+    call: Any  # A GraspCall
+    number: int  # Of all requests
     reply: Future[Reply] = field(default_factory=Future)
-    turn: Future[None] | None = None
-    """Its place in the queue."""
-    task: Future[Reply] | None = None
-    """Its computation, once it is its turn."""
-    since: float = field(default_factory=time.monotonic)
-    """When it came [s]."""
+    turn: Future[None] | None = None  # Its place in the queue
+    task: Future[Reply] | None = None  # Its computation, once it is its turn
+    since: float = field(default_factory=time.monotonic)  # When it came [s]
 
     def abandon(self) -> None:
         """End its computation together with the process, as pebble does with a task that is cancelled while it runs."""
@@ -115,12 +108,10 @@ class Request:
 class Metrics:
     """What a queue has done."""
 
-    replies: Counter[int] = field(default_factory=Counter)
-    """By the status of HTTP."""
+    replies: Counter[int] = field(default_factory=Counter)  # By the status of HTTP
     waiting_seconds: float = 0.0
     computing_seconds: float = 0.0
-    starts: int = 0
-    """Of the process."""
+    starts: int = 0  # Of the process
 
 
 class RequestQueue:

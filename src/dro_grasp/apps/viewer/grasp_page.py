@@ -40,16 +40,11 @@ class ShownGrasps:
 
     hand: Hand
     obj: ObjectModel
-    raw: GraspBatch
-    """As the network proposed them, in the order of the refined ones."""
-    refined: GraspBatch
-    """Best score first."""
-    protocol: str
-    """Protocol of the trials."""
-    shortage: str | None = None
-    """Why there are fewer than were asked for."""
-    on_table: bool = False
-    """Whether a table is shown below them."""
+    raw: GraspBatch  # As the network proposed them, in the order of the refined ones
+    refined: GraspBatch  # Best score first
+    protocol: str  # Protocol of the trials
+    shortage: str | None = None  # Why there are fewer than were asked for
+    on_table: bool = False  # Whether a table is shown below them
     predicted: Float[Tensor, "n n_points 3"] | None = None
     """Hand points multilaterated from D(R,O), before the solver [m]; files do not store them."""
 

@@ -37,15 +37,11 @@ EVERY = "all"  # Choice of every grasp
 class Film:
     """A motion, picture by picture."""
 
-    arm: Float[np.ndarray, "k n_arm"]
-    """[rad or m]"""
-    hand: Float[np.ndarray, "k n_dof"]
-    """[rad or m]"""
-    poses: Float[np.ndarray, "k o 4 4"]
-    """Of the objects in the world [m]; of a plan, those of the cloud that it was made for."""
+    arm: Float[np.ndarray, "k n_arm"]  # [rad or m]
+    hand: Float[np.ndarray, "k n_dof"]  # [rad or m]
+    poses: Float[np.ndarray, "k o 4 4"]  # Of the objects in the world [m]; of a plan, those of the cloud that it was made for
     plan: MotionPlan | None
-    objects: tuple[ObjectModel, ...] = ()
-    """As simulated; none in a plan."""
+    objects: tuple[ObjectModel, ...] = ()  # As simulated; none in a plan
 
     @staticmethod
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:

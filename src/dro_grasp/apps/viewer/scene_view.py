@@ -191,8 +191,7 @@ class Closed(Exception):
 class Page(ABC):
     """A page with a stage and a film of it, which does one thing at a time and shows errors."""
 
-    status: viser.GuiMarkdownHandle
-    """What the page does, and errors; whoever inherits adds it."""
+    status: viser.GuiMarkdownHandle  # What the page does, and errors; whoever inherits adds it
 
     def __init__(self, client: Client) -> None:
         self.client, self.view, self.film = client, SceneView(client), None
