@@ -16,7 +16,6 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dro_grasp.arm.candidates import lowest_points
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
@@ -258,6 +257,12 @@ def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int 
     away = torch.where(directions[:, 2] < STEEPEST, away, torch.inf)
     near = directions[away.topk(64, largest=False).indices]
     return near[farthest_points(near, 8)]
+
+
+def lowest_points(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
+    """Height of the hand's lowest point in pregrasp, grasp and squeeze of complete grasps [m]."""
+    postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
+    return torch.stack([hand.points(q, grasps.T_object_wrist)[..., 2].amin(-1) for q in postures]).amin(0)
 
 
 def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -13,19 +13,16 @@ import tyro
 
 from dro_grasp._version import __version__
 from dro_grasp.cli.benchmark import Benchmark
-from dro_grasp.cli.dataset import Dataset
+from dro_grasp.cli.dataset import Dataset, Synthesize
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
-from dro_grasp.cli.listing import Hands, Objects
+from dro_grasp.cli.listing import Hands, Objects, Weights
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
-from dro_grasp.cli.serve import Serve
-from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train, former_options
-from dro_grasp.cli.view import Picture, View
-from dro_grasp.cli.weights import Weights
+from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
 
 DONE = 0  # Exit code of a command that succeeded

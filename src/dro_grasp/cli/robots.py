@@ -13,12 +13,15 @@ from dro_grasp.cli.inputs import ConstraintOptions, Flag, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from jaxtyping import Float
 
-    from dro_grasp.arm.attempts import Attempt
+    from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.arm.robot import Robot
     from dro_grasp.arm.table_scene import PickedObject
+    from dro_grasp.arm.tabletop import Attempt
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,8 @@ class Plan:
     csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
     json: Flag = False  # Print one JSON object instead of text.
 
-    def run(self) -> int:
-        """Check everything that can be checked before the work, then plan and write."""
+    def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
+        """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
         from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
         from dro_grasp.arm.planner import PlanConfig, plan
         from dro_grasp.arm.robot import load_robot
@@ -98,7 +101,7 @@ class Plan:
                       "`table` in the robot file")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
         if self.output is not None:
             made.save(self.output)
         for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
@@ -208,15 +211,14 @@ class Tabletop:
     """Animation of the first attempt, which is run once more for it."""
     json: Flag = False  # Print one JSON object instead of text.
 
-    def run(self) -> int:
-        """Run what is missing, store and print."""
+    def run(self, make: Callable[..., Attempt] | None = None) -> int:
+        """Run what is missing, or make it in another way, store and print."""
         from dro_grasp.extras import require_extra
 
         require_extra("arm")
         from dro_grasp.arm.animation import FORMATS, draw_attempt
-        from dro_grasp.arm.attempts import TabletopConfig
         from dro_grasp.arm.planner import PlanConfig
-        from dro_grasp.arm.tabletop import TabletopRun, run_tabletop
+        from dro_grasp.arm.tabletop import TabletopConfig, TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
@@ -229,7 +231,7 @@ class Tabletop:
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
-        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)
+        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans, make)
         self._report(done)
         if self.video is not None:
             draw_attempt(run, self.video)

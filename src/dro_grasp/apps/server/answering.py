@@ -17,9 +17,8 @@ from cachetools import LRUCache
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.apps.library import Kind, Library
+from dro_grasp.apps.library import Kind, Library, store_upload
 from dro_grasp.apps.server.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
-from dro_grasp.apps.uploads import store_upload
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
 from dro_grasp.frames import is_name, motion_fault

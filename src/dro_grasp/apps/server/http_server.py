@@ -25,7 +25,6 @@ from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
 from dro_grasp.errors import OptionError, ServerError
 
-BODY_TIMEOUT = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 SHUTDOWN_TIMEOUT = 10.0  # Time that requests under way get to end when the server is stopped [s] (ours)
 MAX_CONNECTIONS = 128  # Most open connections (ours)
 
@@ -37,6 +36,7 @@ class Access:
     host: str = "127.0.0.1"  # Address to serve at; only this machine can connect by default
     token: str | None = None  # What requests must bear; needed where others can connect
     megabytes: float = 32.0  # Largest body of a request [MB]
+    body_seconds: float = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 
     def __post_init__(self) -> None:
         if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
@@ -80,7 +80,8 @@ class Gate:
 
     def _limited(self, receive: Any) -> Any:
         """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits."""
-        size, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_TIMEOUT
+        size, whole, seconds = 0, False, self.access.body_seconds
+        deadline = asyncio.get_running_loop().time() + seconds
 
         async def part() -> Any:
             nonlocal size, whole
@@ -90,7 +91,7 @@ class Gate:
                 async with asyncio.timeout_at(deadline):
                     message = await receive()
             except TimeoutError:
-                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {BODY_TIMEOUT:g} s") from None
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {seconds:g} s") from None
             size += len(message.get("body", b""))
             whole = not message.get("more_body", False)
             if size > 1e6 * self.access.megabytes:

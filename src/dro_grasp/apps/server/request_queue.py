@@ -22,9 +22,6 @@ from pebble import ProcessExpired, ProcessPool
 
 from dro_grasp.errors import DroGraspError, OptionError, ServerError
 
-GRACE = 3.0
-"""Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds [s] (ours)."""
-
 
 class Reply(NamedTuple):
     """What a request comes to: a status of HTTP and a JSON object."""
@@ -118,7 +115,8 @@ class RequestQueue:
     """Takes requests in order, within limits; whatever a request does to the process, the next one is computed."""
 
     def __init__(
-        self, config: Any, longest: int = 16, time_limit: float = 60.0, answerer: Callable[[Any], Any] | None = None
+        self, config: Any, longest: int = 16, time_limit: float = 60.0, answerer: Callable[[Any], Any] | None = None,
+        grace: float = 3.0,
     ) -> None:
         """Start the process, and wait until it has loaded what it computes with.
 
@@ -127,6 +125,8 @@ class RequestQueue:
             longest: Requests that may wait.
             time_limit: A request that is computed for longer is ended [s].
             answerer: Makes what answers, in the process; an `Answerer` by default.
+            grace: Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds
+                [s] (ours).
 
         Raises:
             DroGraspError: A limit is out of range, or something cannot be loaded.
@@ -136,7 +136,7 @@ class RequestQueue:
                               "time")
         if answerer is None:
             from dro_grasp.apps.server.answering import Answerer as answerer
-        self.config, self.longest, self.time_limit, self.answerer = config, longest, time_limit, answerer
+        self.config, self.longest, self.time_limit, self.answerer, self.grace = config, longest, time_limit, answerer, grace
         self.metrics, self.closed = Metrics(), False
         self._known: dict[str, Request] = {}
         self._running: Request | None = None
@@ -193,7 +193,7 @@ class RequestQueue:
                 return False
             if request.turn is None or not request.turn.cancel():
                 self._cancelled.value = request.number
-                patience = threading.Timer(GRACE, request.abandon)
+                patience = threading.Timer(self.grace, request.abandon)
                 patience.daemon = True
                 patience.start()
                 return True
