@@ -61,9 +61,6 @@ class Library:
         """Store an upload that is to be used as a kind, and return the name under which it can be asked for.
 
         An upload replaces the one before of its name and kind; names that another kind has taken get a number.
-
-        Raises:
-            OptionError: The upload is refused.
         """
         folder = Path(self.folder.name) / str(next(self._numbers))
         folder.mkdir()

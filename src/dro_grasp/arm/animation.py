@@ -74,11 +74,7 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
 
 
 def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
-    """Run the first attempt of a run once more, and write its animation.
-
-    Raises:
-        OutputError: The path cannot be written, or the robot did not move.
-    """
+    """Run the first attempt of a run once more, and write its animation."""
     robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
     result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
     draw_animation(robot, recorder, path)

@@ -405,15 +405,8 @@ def grasps_in_world(
 ) -> GraspBatch:
     """Grasps as the predictor returns them for the same request and constraints, the best first; their frame is the world's.
 
-    Args:
-        predictor: Proposes and finishes the grasps.
-        hand: The hand.
-        obj: What is grasped; its z axis points up.
-        T_world_object: Where it stands [m].
-        request: How many, of which source, from which seed.
-        wanted: What they have to respect, in the world's frame.
-        directions: Which palm directions, where none is wanted; unit vectors in the world if they are given. Each of them gets
-            a request of its own, with its share of the grasps.
+    The object's z axis points up, and constraints are in the world's frame. Where these want no palm direction, each of those
+    that are given, unit vectors in the world, gets a request of its own, with its share of the grasps.
     """
     T = torch.from_numpy(T_world_object).float()
     problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))

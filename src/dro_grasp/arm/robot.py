@@ -188,11 +188,7 @@ def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
 
 
 def locate_robot(name: str | Path) -> Path:
-    """The file of a built-in robot, or the path that is given.
-
-    Raises:
-        RobotError: There is neither.
-    """
+    """The file of a built-in robot, or the path that is given."""
     path, builtin = given_path(name), BUILTIN_ROBOTS / f"{name}.yaml"
     if "/" not in str(name) and builtin.is_file():
         return builtin

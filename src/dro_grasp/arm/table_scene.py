@@ -161,11 +161,7 @@ def sort_out(
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
-    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m].
-
-    Raises:
-        ObjectError: There is none.
-    """
+    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m]."""
     plane = largest_plane(points, THICKNESS / 2, 0.2, fits=3)
     if plane is None or (np.abs(points @ plane[:3] - plane[3]) < THICKNESS / 2).sum() < FEWEST:
         raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")

@@ -187,16 +187,9 @@ def attempt(
     robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
     watch: Watcher | None = None, proposer: Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch] | None = None,
 ) -> Attempt:
-    """Run one attempt from beginning to end.
+    """Run one attempt from beginning to end; each number draws another place of the object.
 
     Args:
-        robot: With table, and with a camera if that is what sees.
-        obj: A mesh.
-        number: Of the attempt; it draws another place of the object.
-        seed: Of all draws.
-        predictor: Proposes grasps.
-        config: How it runs.
-        watch: Is told what happens.
         proposer: Makes complete grasps with scores, in the world, of what was seen, the pose of its frame and a seed, instead
             of the predictor.
 
@@ -457,11 +450,7 @@ def run_tabletop(
 def _done(
     run: TabletopRun, stored: Sequence[Attempt], output: Path | None
 ) -> tuple[dict[tuple[str, int], Attempt], dict[str, str]]:
-    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each.
-
-    Raises:
-        OptionError: Some are of another object of the name.
-    """
+    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each."""
     robot, weights, objects = load_robot(run.robot), describe_weights(run.weights)["sha256"], _objects(run.objects)
     alike = [a for a in stored if (a.robot, a.settings, a.seed) == (robot.name, run.config.label(), run.seed)]
     done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
@@ -475,11 +464,7 @@ def _done(
 
 
 def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """What each object was given as, and its hashes, by its name.
-
-    Raises:
-        OptionError: Two of them differ and have one name.
-    """
+    """What each object was given as, and its hashes, by its name."""
     found: dict[str, tuple[str, str, str]] = {}
     for source in dict.fromkeys(given):
         obj = load_object(source)
@@ -529,11 +514,7 @@ def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
 
 
 def read_attempts(path: Path) -> list[Attempt]:
-    """Read such a file.
-
-    Raises:
-        GraspFileError: It is another file.
-    """
+    """Read such a file."""
     known = {f.name for f in fields(Attempt)}
     expected = "a file of attempts; name another one, or move this one away"
     with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing

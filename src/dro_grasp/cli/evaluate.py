@@ -80,11 +80,7 @@ class Evaluate:
     def _problems(
         self, hand: Hand, grasps: GraspBatch
     ) -> tuple[list[tuple[str, GraspProblem, GraspBatch]], dict[str, GraspBatch]]:
-        """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds.
-
-        Raises:
-            ObjectError: All objects are bare clouds.
-        """
+        """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds."""
         from dro_grasp.errors import ObjectError
         from dro_grasp.grasps.sources import object_of
         from dro_grasp.predict.problem import GraspProblem
@@ -148,11 +144,7 @@ class Evaluate:
 
 
 def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:
-    """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones.
-
-    Raises:
-        OptionError: Outcomes with it are to be saved, where they would pass for those with the grasps' own.
-    """
+    """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones."""
     from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import made_for_another
 

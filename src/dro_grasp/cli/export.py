@@ -108,11 +108,7 @@ def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
 
 
 def refuse_mixing(folder: Path, suffix: str) -> None:
-    """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new.
-
-    Raises:
-        OutputError: It holds some.
-    """
+    """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new."""
     from dro_grasp.errors import OutputError
 
     old = next((path for pattern in (f"*{suffix}", f"*/*{suffix}") for path in folder.glob(pattern)), None)

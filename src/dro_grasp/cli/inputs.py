@@ -38,11 +38,7 @@ class PalmOptions:
     """Least distance [m] between the object and every link that closes, in pregrasp."""
 
     def constraints(self, table: float | None = None, avoid: Scene | None = None) -> Constraints:
-        """These options, with a table's height [m] and what stands around.
-
-        Raises:
-            OptionError: Something cannot be respected.
-        """
+        """These options, with a table's height [m] and what stands around."""
         from dro_grasp.predict.constraints import Constraints
 
         return Constraints(table=table, avoid=avoid, **asdict(self))

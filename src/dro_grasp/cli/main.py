@@ -79,11 +79,7 @@ def parse(arguments: Sequence[str]) -> Any:
 
 
 def without_threads(arguments: Sequence[str]) -> list[str]:
-    """The arguments without `--threads N`, which is set for this process and those that it starts.
-
-    Raises:
-        OptionError: N is no number, or less than 1.
-    """
+    """The arguments without `--threads N`, which is set for this process and those that it starts."""
     rest = [word for argument in arguments for word in argument.split("=", int(argument.startswith("--threads=")))]
     if "--threads" in rest:
         place = rest.index("--threads")

@@ -63,11 +63,7 @@ class Stage:
     former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)  # Options of `FORMER_OPTIONS` that were given.
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
-        """The configuration of the preset, else of the initial weights, else of `multi`.
-
-        Raises:
-            OptionError: A former option asks for something else than there is.
-        """
+        """The configuration of the preset, else of the initial weights, else of `multi`."""
         from dro_grasp.errors import OptionError
         from dro_grasp.network.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
@@ -84,11 +80,7 @@ class Stage:
         return network
 
     def schedule(self, **more: Any) -> ScheduleConfig:
-        """The schedule, which can be carried out here.
-
-        Raises:
-            OptionError: It cannot.
-        """
+        """The schedule, which can be carried out here."""
         from dro_grasp.devices import choose_device
         from dro_grasp.train.config import ScheduleConfig
         from dro_grasp.train.runs import check_schedule

@@ -241,12 +241,7 @@ def is_motion(file: Path) -> bool:
 
 
 def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
-    """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first.
-
-    Raises:
-        DroGraspError: The object cannot be loaded.
-        OptionError: The grasps name no such object, and they have several.
-    """
+    """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first."""
     from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import object_of
 

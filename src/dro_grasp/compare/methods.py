@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 
@@ -19,9 +19,6 @@ from dro_grasp.predict.sources.controls import MeanGrasp
 from dro_grasp.predict.sources.registry import WITH_DATA, make_source, present_name
 from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
-if TYPE_CHECKING:
-    from dro_grasp.train.data.bundle.training_file import Bundle
-
 
 @dataclass(frozen=True)
 class MethodOptions(Checked):
@@ -33,8 +30,8 @@ class MethodOptions(Checked):
     """Where networks run."""
     temperature: float | None = None
     """Spread of z of the D(R,O) network."""
-    bundle: Bundle | None = None
-    """Training grasps, for the mean grasp."""
+    bundle: Any = None  # its class is of training, which lies above comparing
+    """A `Bundle` of training grasps, for the mean grasp."""
     candidates: int = GraspRequest.candidates
     """Candidates for each grasp that a method returns."""
 
@@ -116,7 +113,7 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     return Method(source, predictor, label, options.candidates)
 
 
-def mean_grasps_of(bundle: Bundle) -> dict[str, MeanGrasp]:
+def mean_grasps_of(bundle: Any) -> dict[str, MeanGrasp]:
     """The mean grasp of each hand in a training bundle that has grasps."""
     clouds = torch.stack([cloud.points.mean(0) for cloud in bundle.objects.values()])
     means = {}

@@ -72,14 +72,7 @@ class Row:
 
 
 def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
-    """One hand's line.
-
-    Args:
-        source: Where the grasps come from.
-        stage: What was done to them.
-        parts: The hand's grasps, one entry for each view of each object; each states how many were asked for.
-        protocols: Of the results, in their order.
-    """
+    """One hand's line, of its grasps for each view of each object, which state how many were asked for."""
     success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
     asked, numbers = sum(t.grasps.out_of for t in parts), {}
     held_in, fingers = {}, {}

@@ -69,14 +69,9 @@ def benchmark(
     hands: Sequence[Hand], objects: Sequence[ObjectModel], methods: Sequence[Method], config: BenchmarkConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Measure the success rates.
+    """Measure the success rates on objects with meshes; a method has no rows of hands that it does not know.
 
-    Args:
-        hands: Which hands; a method has no rows of those that it does not know.
-        objects: Which objects, all with meshes.
-        methods: What makes the grasps.
-        config: Numbers, stages and protocols.
-        progress: Called with (pairs done, pairs in all).
+    `progress` is called with (pairs done, pairs in all).
 
     Raises:
         OptionError: Two methods have one name, or a method returns more grasps than it was asked for.

@@ -49,7 +49,7 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio) -> None:
     assert found.avoid is not None
     assert found.avoid.name == "shelf"
     panel.avoid.value = NOTHING
-    assert asked(studio, monkeypatch).avoid is None
+    assert asked(studio)[0].constraints.avoid is None
 
 
 @pytest.mark.parametrize(("field", "text", "message"), [

@@ -71,15 +71,7 @@ class Answerer:
         self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
     def _offer(self, kind: Kind, named: Sequence[tuple[str, str, Any]]) -> None:
-        """Let what lies in files be asked for by name.
-
-        Args:
-            kind: What all are.
-            named: Name, name or file that was given, and what the library takes, of each.
-
-        Raises:
-            OptionError: Two have one name.
-        """
+        """Let what lies in files be asked for: of each its name, the name or file that was given, and what the library takes."""
         first: dict[str, str] = {}
         for name, source, content in named:
             other = first.setdefault(name, source)
@@ -89,11 +81,7 @@ class Answerer:
             self.library.add(kind, name, content)
 
     def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
-        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work.
-
-        Raises:
-            DroGraspError: The request cannot be met.
-        """
+        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work."""
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
         constraints = settings_in(call, Constraints, avoid=self.scene(call.avoid, call.camera))

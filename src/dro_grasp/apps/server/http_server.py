@@ -206,11 +206,7 @@ def metrics_text(queue: RequestQueue) -> str:
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens at an address.
-
-    Raises:
-        OptionError: This machine cannot listen there.
-    """
+    """A socket that listens at an address."""
     if not 0 <= port < 2**16:
         raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -57,11 +57,7 @@ class Film:
 
     @staticmethod
     def of_attempt(recorder: Recorder) -> Film:
-        """What was simulated.
-
-        Raises:
-            OptionError: The robot did not move.
-        """
+        """What was simulated."""
         if not recorder.frames:
             raise OptionError("the attempt ended before the robot moved; there is nothing to play")
         arm, hand, poses = (np.stack(part) for part in zip(*recorder.frames, strict=True))
@@ -83,7 +79,6 @@ class LiftPage(ServedPage, Page):
         """Start serving with the robot at home.
 
         Args:
-            robot: The robot that is shown first.
             attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
             weights: Name or file, where those that they were made with are not meant.
             make: Runs them.
@@ -233,9 +228,6 @@ def lift_page(
     """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
 
     Robot and weights are given, by name or file, where the file's own are not meant.
-
-    Raises:
-        DroGraspError: The file or the robot cannot be used.
     """
     if file.suffix.lower() == ".npz":
         plan = MotionPlan.load(file)

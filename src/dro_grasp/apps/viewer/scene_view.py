@@ -243,12 +243,8 @@ class Page(ABC):
         self._say(f"**Error:** {escaped(error)}")
 
     def _say(self, text: str) -> None:
-        """Show a line.
-
-        Raises:
-            Closed: Nobody sees it any more; whatever goes on ends here.
-        """
-        if self.closed.is_set():
+        """Show a line."""
+        if self.closed.is_set():  # nobody sees it any more, and whatever goes on ends here
             raise Closed
         self.status.content = text
 
