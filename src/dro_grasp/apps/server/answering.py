@@ -71,7 +71,7 @@ class Answerer:
         self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
     def _offer(self, kind: Kind, named: Sequence[tuple[str, str, Any]]) -> None:
-        """Let what lies in files be asked for: of each its name, the name or file that was given, and what the library takes."""
+        """Let what lies in files be asked for: of each its name, the name or file given, and what the library takes."""
         first: dict[str, str] = {}
         for name, source, content in named:
             other = first.setdefault(name, source)
