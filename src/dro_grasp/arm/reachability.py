@@ -21,6 +21,7 @@ from dro_grasp.arm.workcell import VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 
 TURNED = 0.12  # Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)
