@@ -63,7 +63,8 @@ def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_
 
 @pytest.fixture(scope="module")
 def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
-    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, dro.Constraints(table=0.0))
+    request = dro.GraspRequest(12, candidates=1)
+    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), request, dro.Constraints(table=0.0))
 
 
 def evenly(robot: dro.Robot, rows: np.ndarray, distance: float) -> np.ndarray:

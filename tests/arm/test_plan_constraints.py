@@ -111,7 +111,8 @@ def test_a_frame_turns_directions_and_places_and_lifts_the_table() -> None:
 def test_what_grasps_are_given_is_checked_as_well(
     robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
 ) -> None:
-    grasps = grasps_in_world(dro.GraspPredictor(), robot.hand, *standing, 4, dro.Constraints(table=0.0))
+    request = dro.GraspRequest(4, candidates=1)
+    grasps = grasps_in_world(dro.GraspPredictor(), robot.hand, *standing, request, dro.Constraints(table=0.0))
     x, y = standing[1][:2, 3].tolist()
     config = dro.PlanConfig(constraints=dro.Constraints(spare=((x, y, 0.06, 0.06),)))
     with pytest.raises(dro.DroGraspError, match=r"4 grasps: 4 in a place to spare, .* relax cone, hold, spare or opening"):
