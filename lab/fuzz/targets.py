@@ -19,7 +19,7 @@ import torch
 import trimesh
 from safetensors.torch import load, save
 
-from dro_grasp.apps.uploads import store_upload
+from dro_grasp.apps.library import store_upload
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion
 from dro_grasp.grasps.batch import GraspBatch

@@ -12,7 +12,10 @@ from PIL import Image
 
 import dro_grasp as dro
 from dro_grasp.arm.animation import Recorder, draw_animation
-from dro_grasp.arm.attempts import (
+from dro_grasp.arm.physics import Deviation, LiftScene
+from dro_grasp.arm.planner import PlanConfig
+from dro_grasp.arm.table_scene import sort_out
+from dro_grasp.arm.tabletop import (
     APART,
     STRIDE,
     TabletopConfig,
@@ -23,9 +26,6 @@ from dro_grasp.arm.attempts import (
     scatter,
     thinned_intrinsics,
 )
-from dro_grasp.arm.physics import Deviation, LiftScene
-from dro_grasp.arm.planner import PlanConfig
-from dro_grasp.arm.table_scene import sort_out
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.perception.scan import depth_points
 

@@ -11,9 +11,8 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.arm.candidates import grasps_in_world
 from dro_grasp.arm.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
-from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.planner import PlanConfig, grasps_in_world, plan
 from dro_grasp.arm.reachability import Fault, Feasible, Postures
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.shape import solid_of

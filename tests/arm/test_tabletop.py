@@ -11,9 +11,17 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.arm import tabletop
-from dro_grasp.arm.attempts import Attempt, TabletopConfig
 from dro_grasp.arm.planner import PlanConfig
-from dro_grasp.arm.tabletop import TabletopRun, endings, failures, read_attempts, run_tabletop, write_attempts
+from dro_grasp.arm.tabletop import (
+    Attempt,
+    TabletopConfig,
+    TabletopRun,
+    endings,
+    failures,
+    read_attempts,
+    run_tabletop,
+    write_attempts,
+)
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.network.checkpoints import DEFAULT, load_weights, save_weights

@@ -12,13 +12,14 @@ import trimesh
 from PIL import Image
 
 from dro_grasp.apps.viewer.studio import StudioServer
-from dro_grasp.cli.main import main
+from dro_grasp.cli.main import main, parse
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.sources.controls import palm_facing_starts
+from dro_grasp.train.data.collections import checking
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited
@@ -65,11 +66,10 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
 
 
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
-def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_takes_a_folder(folder: Path) -> None:
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
-        assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
+        assert parse(["view", str(folder), "--port", str(free_port()), *more]).run(servers.append) == 0
     try:
         for server in servers:
             visited(server, 1)
@@ -100,7 +100,7 @@ def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hand, batches, objects = loaded_hand("gripper3"), [], []
     for folder, side, num in (("003", 0.05, 1), ("004", 0.06, 2)):
@@ -109,7 +109,7 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
         obj = load_object(tmp_path / folder / "textured.obj")
         batches.append(with_own_files(palm_facing_starts(hand, obj, num=num, seed=0), hand, obj))
         objects.append(obj)
-    file, sheet = tmp_path / "both.parquet", tmp_path / "sheet.png"
+    file = tmp_path / "both.parquet"
     GraspBatch.concatenate(batches).save(file)
     assert main(["evaluate", str(file), "--json"]) == 0
     said = capsys.readouterr()
@@ -117,12 +117,10 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     assert {name: entry["num"] for name, entry in json.loads(said.out)["objects"].items()} == {"textured": 1, "textured (2)": 2}
     assert main(["export", str(file), "--format", "csv", "--output", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["textured (2).csv", "textured.csv"]
-    drawn: list[list[tuple[str, int]]] = []
-    monkeypatch.setattr("dro_grasp.pictures.sheets.draw_sheet", lambda hand, pairs, *_: drawn.append(
-        [(obj.sha256, len(own)) for obj, own in pairs]))
-    for more in ([], ["--object", "textured (2)"]):
-        assert main(["picture", str(file), "--output", str(sheet), *more]) == 0
-    assert drawn == [[(objects[0].sha256, 1), (objects[1].sha256, 2)], [(objects[1].sha256, 2)]]
+    for more, drawn in (([], objects), (["--object", "textured (2)"], objects[1:])):
+        pairs = parse(["picture", str(file), "--output", "sheet.png", *more]).pairs(load_grasps(file))
+        assert [obj.sha256 for obj, _ in pairs] == [obj.sha256 for obj in drawn]
+        assert [len(own) for _, own in pairs] == [1, 2][-len(drawn):]
     parts = dict(GraspBatch.load(file).by_object())
     assert [object_of(parts[name], None, 1.0).sha256 for name in ("textured", "textured (2)")] == [o.sha256 for o in objects]
 
@@ -165,7 +163,7 @@ def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
     def none(*_: object, **__: object) -> None:
         raise AssertionError("a trial")
 
-    monkeypatch.setattr("dro_grasp.train.data.collections.checking.simulate", none)
+    monkeypatch.setattr(checking, "simulate", none)
     assert main(["dataset", *command.split(), str(beside_a_cloud)]) == 2
     assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
-from dro_grasp.cli.main import main
-from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.cli.main import main, parse
+from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.sources.controls import palm_facing_starts
@@ -36,13 +36,12 @@ def both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GraspBatch:
 
 
 @pytest.fixture
-def first_page(monkeypatch: pytest.MonkeyPatch):
+def first_page():
     """What opens the page of `view` with some arguments, and returns it."""
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", servers.append)
 
     def opened(*arguments: str) -> Studio:
-        assert main(["view", *arguments, "--port", str(free_port())]) == 0
+        assert parse(["view", *arguments, "--port", str(free_port())]).run(servers.append) == 0
         visited(servers[-1], 1)
         return servers[-1].studios[0]
 
@@ -94,9 +93,8 @@ def test_a_hand_of_other_joints_is_refused(both: GraspBatch, command: str, capsy
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 @pytest.mark.parametrize("command", ["view", "picture"])
 def test_a_mesh_does_not_replace_one_of_several_objects(
-    both: GraspBatch, command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    both: GraspBatch, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", StudioServer.stop)
     name, *more = COMMANDS[command]
     assert main([name, "both.parquet", "--object", "sphere", *more]) == 2
     assert "--object is 'sphere', but the grasps are of 2 objects (mug, can)" in capsys.readouterr().err
@@ -115,17 +113,14 @@ def test_an_object_that_is_given_stands_for_one_alone(
 
 
 def test_an_object_without_success_does_not_get_the_grasps_of_another(
-    both: GraspBatch, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    both: GraspBatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     both.replace(success=torch.tensor([False, True, False]), protocol=("strict/1",) * 3).save("both.parquet")
-    drawn: list[list[tuple[str, int]]] = []
-    monkeypatch.setattr("dro_grasp.pictures.sheets.draw_sheet", lambda hand, pairs, *_: drawn.append(
-        [(obj.name, len(own)) for obj, own in pairs]))
     command = ["picture", "both.parquet", "--only-successful", "--output", "sheet.png"]
     assert main([*command, "--object", "mug"]) == 2
     assert "no grasp of mug in both.parquet has passed a trial; leave out --only-successful" in capsys.readouterr().err
     assert main([*command, "--object", "sphere"]) == 2
     assert "--object is 'sphere'" in capsys.readouterr().err
     for more in ([], ["--object", "can"]):
-        assert main([*command, *more]) == 0
-    assert drawn == [[("can", 1)]] * 2
+        drawn = parse([*command, *more]).pairs(load_grasps("both.parquet"))
+        assert [(obj.name, len(own)) for obj, own in drawn] == [("can", 1)]

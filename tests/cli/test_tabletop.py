@@ -3,46 +3,50 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import dro_grasp as dro
 from dro_grasp import extras
-from dro_grasp.arm import tabletop
-from dro_grasp.arm.attempts import Attempt, TabletopConfig
-from dro_grasp.cli.main import main
+from dro_grasp.arm.tabletop import Attempt, TabletopConfig
+from dro_grasp.cli.main import parse
+
+Lift = Callable[..., int]
 
 
 @pytest.fixture
-def done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Attempt]:
-    """The attempts that were made: of a can they hold, of anything else the first one falls."""
-    done: list[Attempt] = []
+def done() -> list[Attempt]:
+    """The attempts that were made."""
+    return []
 
-    def attempt(robot: Any, obj: Any, number: int, seed: int, weights: Any, config: TabletopConfig, _: object) -> Attempt:
-        assert weights == "mine"
+
+@pytest.fixture
+def lifted(done: list[Attempt], small_robot: str, weights: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Lift:
+    """The command in an empty folder, with attempts of which those with a can hold; of anything else, the first one falls."""
+    monkeypatch.chdir(tmp_path)
+
+    def attempt(
+        robot: Any, obj: Any, number: int, seed: int, predictor: dro.GraspPredictor, config: TabletopConfig, _: object
+    ) -> Attempt:
+        assert predictor.weights_name == dro.load_weights(weights).name
         held = obj.name == "can" or number > 0
         done.append(Attempt(robot.name, obj.name, number, seed, config.label(), held, "done" if held else "lift",
                             "" if held else "it fell", processor_seconds=1.0 + number))
         return done[-1]
 
-    monkeypatch.setattr(tabletop, "attempt", attempt)
-    monkeypatch.setattr(tabletop, "load_robot", lambda name: SimpleNamespace(name=name, sha256=name))
-    monkeypatch.setattr(tabletop, "describe_weights", lambda weights: {"sha256": weights})
-    monkeypatch.setattr(tabletop, "GraspPredictor", lambda weights: weights)
-    monkeypatch.chdir(tmp_path)
-    return done
+    def lifted(*options: str) -> int:
+        common = ["--robot", small_robot, "--objects", "can", "cube", "--attempts", "2", "--weights", weights]
+        return parse(["tabletop", *common, *options]).run(attempt)
 
-
-def lifted(*options: str) -> int:
-    common = ["--robot", "some_robot", "--objects", "can", "cube", "--attempts", "2", "--weights", "mine"]
-    return main(["tabletop", *common, *options])
+    return lifted
 
 
 def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
-    done: list[Attempt], capsys: pytest.CaptureFixture[str]
+    lifted: Lift, done: list[Attempt], small_robot: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert lifted("--see", "mesh", "--order", "random", "--direction", "0", "0", "-1", "--max-tilt", "0.6",
                   "--pregrasp-clearance", "0.012",
@@ -52,7 +56,7 @@ def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
     config = TabletopConfig("mesh", 0.003, clutter=2, segment="mask", plan=dro.PlanConfig(
         9, order="random", rehearsals=4, constraints=constraints))
     assert [TabletopConfig.from_label(a.settings) for a in done] == [config] * 4
-    assert {(a.robot, a.seed) for a in done} == {("some_robot", 5)}
+    assert {(a.robot, a.seed) for a in done} == {(dro.load_robot(small_robot).name, 5)}
     assert [(a.object, a.number) for a in done] == [("can", 0), ("can", 1), ("cube", 0), ("cube", 1)]
     told = json.loads(capsys.readouterr().out)
     assert (told["attempts"], told["success"], told["success_rate"]) == (4, 3, 0.75)
@@ -61,7 +65,9 @@ def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
     assert told["processor_seconds"] == pytest.approx({"median": 1.5, "within_95": 2.0, "n": 4})
 
 
-def test_people_see_objects_rates_and_every_attempt_aside(done: list[Attempt], capsys: pytest.CaptureFixture[str]) -> None:
+def test_people_see_objects_rates_and_every_attempt_aside(
+    lifted: Lift, done: list[Attempt], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert lifted("--output", "results.parquet") == 0
     assert {a.settings for a in done} == {TabletopConfig().label()}
     said = capsys.readouterr()
@@ -85,18 +91,18 @@ def test_people_see_objects_rates_and_every_attempt_aside(done: list[Attempt], c
     (["--direction", "0", "0", "-1", "--directions", "paper"], "leave out one of them"),
 ])
 def test_what_cannot_be_attempted_is_refused_in_words(
-    options: list[str], said: str, done: list[Attempt], capsys: pytest.CaptureFixture[str]
+    options: list[str], said: str, lifted: Lift, done: list[Attempt]
 ) -> None:
     Path("mine").write_text("mine")
-    assert lifted(*options) == 2
-    assert said in capsys.readouterr().err
+    with pytest.raises(dro.DroGraspError, match=re.escape(said)):
+        lifted(*options)
     assert not done
 
 
 def test_without_the_extra_it_says_what_to_install(
-    done: list[Attempt], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lifted: Lift, done: list[Attempt], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
-    assert lifted() == 2
-    assert "pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
+    with pytest.raises(dro.DroGraspError, match=re.escape("pip install '.[arm]' in the folder of the clone")):
+        lifted()
     assert not done

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.compare.equal_time import Returned, equal_time, finished_maker
 from dro_grasp.compare.methods import Method
+from dro_grasp.compare.stages import Returned, equal_time, finished_maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import PredictorConfig

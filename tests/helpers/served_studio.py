@@ -7,25 +7,49 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 import viser
 
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
-from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.errors import NoGraspError
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Progress
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
 
 
+class Listener(GraspPredictor):
+    """Notes what it is asked for, and makes nothing."""
+
+    asked: list[tuple[GraspProblem, GraspRequest]]
+
+    def run(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Prediction:
+        self.asked = [(problem, request)]
+        raise NoGraspError("nothing is made")
+
+
 @contextmanager
-def served_studio(folder: Path) -> Iterator[Studio]:
+def served_studio(folder: Path, predictor: type[GraspPredictor] = GraspPredictor) -> Iterator[Studio]:
     """A page with a hand and an object, and weights in the folder."""
     served = ServedPage(free_port(), HOST)
-    studio = Studio(served.server, GraspPredictor(str(untrained_weights(folder))), "gripper3", "sphere")
+    studio = Studio(served.server, predictor(str(untrained_weights(folder))), "gripper3", "sphere")
+    studio.frame_seconds = 0.0
     try:
         yield studio
     finally:
         studio.close()
         served.stop()
+
+
+def asked(studio: Studio) -> tuple[GraspProblem, GraspRequest]:
+    """What a click on Generate asks of a `Listener`."""
+    assert isinstance(studio.predictor, Listener)
+    with pytest.raises(NoGraspError):
+        studio._generate()
+    return studio.predictor.asked[0]
 
 
 class Browser(viser.ClientHandle):

@@ -10,13 +10,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from dro_grasp.arm.attempts import Attempt, Watcher, attempt
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.robot import Robot, Table, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
 from dro_grasp.arm.table_scene import PickedObject
-from dro_grasp.arm.tabletop import TabletopRun
+from dro_grasp.arm.tabletop import Attempt, TabletopRun, Watcher, attempt
 from dro_grasp.errors import OutputError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, render
@@ -35,16 +34,12 @@ OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)  # Green of other objects on the table
 class Recorder(Watcher):
     """Keeps what a scene looks like, and the plan that is carried out in it."""
 
-    rate: float = RATE
-    """Pictures a second."""
+    rate: float = RATE  # Pictures a second
     frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
-        default_factory=list)
-    """Arm, hand [rad or m], and the objects' poses [m]."""
-    objects: tuple[ObjectModel, ...] = ()
-    """The objects in the scene, the one that is asked for first."""
+        default_factory=list)  # Arm, hand [rad or m], and the objects' poses [m]
+    objects: tuple[ObjectModel, ...] = ()  # The objects in the scene, the one that is asked for first
     plan: MotionPlan | None = None
-    next_time: float | None = None
-    """Simulated time of the next frame [s]."""
+    next_time: float | None = None  # Simulated time of the next frame [s]
 
     def planned(self, seen: PickedObject, made: MotionPlan) -> None:
         """Keep the plan."""
@@ -79,11 +74,7 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
 
 
 def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
-    """Run the first attempt of a run once more, and write its animation.
-
-    Raises:
-        OutputError: The path cannot be written, or the robot did not move.
-    """
+    """Run the first attempt of a run once more, and write its animation."""
     robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
     result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
     draw_animation(robot, recorder, path)

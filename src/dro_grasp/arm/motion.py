@@ -34,14 +34,10 @@ DIGITS = 6  # Decimals of joint values in trajectories: micrometres and microrad
 class Trajectory:
     """Joints over time, from rest to rest."""
 
-    time: Float[np.ndarray, " k"]
-    """From zero [s]."""
-    position: Float[np.ndarray, "k n"]
-    """[rad or m]"""
-    velocity: Float[np.ndarray, "k n"]
-    """[rad/s or m/s]"""
-    acceleration: Float[np.ndarray, "k n"]
-    """[rad/s^2 or m/s^2]"""
+    time: Float[np.ndarray, " k"]  # From zero [s]
+    position: Float[np.ndarray, "k n"]  # [rad or m]
+    velocity: Float[np.ndarray, "k n"]  # [rad/s or m/s]
+    acceleration: Float[np.ndarray, "k n"]  # [rad/s^2 or m/s^2]
 
     @property
     def seconds(self) -> float:
@@ -53,14 +49,10 @@ class Trajectory:
 class MotionPoint:
     """Where arm and hand should be at one time."""
 
-    time: float
-    """Since the start [s]."""
-    stage: str
-    """One of STAGES."""
-    arm: Float[np.ndarray, " n_arm"]
-    """[rad or m]"""
-    hand: Float[np.ndarray, " n_dof"]
-    """[rad or m]"""
+    time: float  # Since the start [s]
+    stage: str  # One of STAGES
+    arm: Float[np.ndarray, " n_arm"]  # [rad or m]
+    hand: Float[np.ndarray, " n_dof"]  # [rad or m]
 
 
 @dataclass(frozen=True)
@@ -71,43 +63,28 @@ class PlanNotes:
     object: str
     arm_joints: tuple[str, ...]
     hand_joints: tuple[str, ...]
-    frame: str
-    """The frame that wrist poses are in: that of the robot's world."""
-    table: float | None
-    """Height of the table that was planned for [m]."""
-    grasps: int
-    """Grasps that there were to choose from."""
-    dropped: dict[str, int]
-    """How many of them were dropped, by reason."""
-    goals: int
-    """Grasps that were given to the planner at once."""
-    chosen: int
-    """Index of the grasp in the batch, best score first."""
-    score: float
-    """Its score."""
-    T_world_wrist: list[list[float]]
-    """The wrist pose of the grasp [m], from which an arm with few joints may turn a little."""
+    frame: str  # The frame that wrist poses are in: that of the robot's world
+    table: float | None  # Height of the table that was planned for [m]
+    grasps: int  # Grasps that there were to choose from
+    dropped: dict[str, int]  # How many of them were dropped, by reason
+    goals: int  # Grasps that were given to the planner at once
+    chosen: int  # Index of the grasp in the batch, best score first
+    score: float  # Its score
+    T_world_wrist: list[list[float]]  # The wrist pose of the grasp [m], from which an arm with few joints may turn a little
     seed: int
-    seconds: dict[str, float]
-    """Time spent on planning, by part [s]."""
+    seconds: dict[str, float]  # Time spent on planning, by part [s]
 
 
 @dataclass(frozen=True, eq=False)
 class PlanScene:
     """What a motion was planned for, in the world: for pictures, and for checks by others."""
 
-    points: Float[np.ndarray, "n 3"]
-    """Of the object [m]."""
-    others: Float[np.ndarray, "m 3"]
-    """Of obstacles [m]."""
-    T_world_wrist: Float[np.ndarray, "g 4 4"]
-    """Wrist poses of all grasps that there were [m]."""
-    joints: Float[np.ndarray, "g n_dof"]
-    """Their joints [rad or m]."""
-    score: Float[np.ndarray, " g"]
-    """Their scores."""
-    fate: tuple[str, ...]
-    """CHOSEN, READY, WAITING, or why each was dropped."""
+    points: Float[np.ndarray, "n 3"]  # Of the object [m]
+    others: Float[np.ndarray, "m 3"]  # Of obstacles [m]
+    T_world_wrist: Float[np.ndarray, "g 4 4"]  # Wrist poses of all grasps that there were [m]
+    joints: Float[np.ndarray, "g n_dof"]  # Their joints [rad or m]
+    score: Float[np.ndarray, " g"]  # Their scores
+    fate: tuple[str, ...]  # CHOSEN, READY, WAITING, or why each was dropped
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,12 +45,9 @@ FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has clos
 class Deviation:
     """What is different from what the planner thinks."""
 
-    shift: tuple[float, float] = (0.0, 0.0)
-    """The object stands elsewhere on the table [m]."""
-    friction: float = 1.0
-    """Factor of the friction."""
-    weight: float = 1.0
-    """Factor of the object's weight."""
+    shift: tuple[float, float] = (0.0, 0.0)  # The object stands elsewhere on the table [m]
+    friction: float = 1.0  # Factor of the friction
+    weight: float = 1.0  # Factor of the object's weight
 
 
 DEVIATIONS = (Deviation(), Deviation((0.008, 0.0), 0.8, 1.3), Deviation((-0.004, 0.007), 0.8, 1.3),

@@ -17,17 +17,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.arm.candidates import Directions, grasps_in_world
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
 from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.trajectory import find_path, timed_stages
 from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
-from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.devices import side_by_side
+from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
@@ -38,6 +39,9 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
 from dro_grasp.predict.stopwatch import Stopwatch
+
+Directions = Literal["paper", "all"]  # Palm directions that are asked for
+PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 
 @dataclass(frozen=True)
@@ -149,13 +153,10 @@ class Task:
     """One object to lift."""
 
     cell: Workcell
-    obj: ObjectModel
-    """With a frame whose z axis points up."""
-    T: Float[np.ndarray, "4 4"]
-    """Where it stands in the world [m]."""
+    obj: ObjectModel  # With a frame whose z axis points up
+    T: Float[np.ndarray, "4 4"]  # Where it stands in the world [m]
     config: PlanConfig
-    constraints: Constraints
-    """Without obstacles, which the cell has."""
+    constraints: Constraints  # Without obstacles, which the cell has
     seed: int
 
     @staticmethod
@@ -225,18 +226,13 @@ class Tries:
     """What became of the grasps so far, by their number, in the order in which they were made."""
 
     parts: list[GraspBatch] = field(default_factory=list)
-    waiting: list[int] = field(default_factory=list)
-    """Not tried yet, in the order of trying."""
+    waiting: list[int] = field(default_factory=list)  # Not tried yet, in the order of trying
     ready: list[Feasible] = field(default_factory=list)
     """Left over from the last batch: they can be carried out, but were not trusted."""
-    found: dict[int, Feasible] = field(default_factory=dict)
-    """Can be carried out."""
-    share: dict[int, float] = field(default_factory=dict)
-    """Share of the rehearsals in which a grasp holds the object."""
-    lost: list[Feasible] = field(default_factory=list)
-    """Can be carried out, but lose the object when rehearsed."""
-    dropped: dict[int, str] = field(default_factory=dict)
-    """Why."""
+    found: dict[int, Feasible] = field(default_factory=dict)  # Can be carried out
+    share: dict[int, float] = field(default_factory=dict)  # Share of the rehearsals in which a grasp holds the object
+    lost: list[Feasible] = field(default_factory=list)  # Can be carried out, but lose the object when rehearsed
+    dropped: dict[int, str] = field(default_factory=dict)  # Why
     watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
 
     @property
@@ -392,3 +388,48 @@ def _described(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
     return notes, scene
+
+
+def paper_directions(count: int) -> Float[Tensor, "k 3"]:
+    """Unit vectors in the world, at most `count`: from above to the right side, whence the palm looks to the left.
+
+    z points up, and the robot looks along x.
+    """
+    angles = torch.linspace(0, math.pi / 2, PAPER_DIRECTIONS)
+    every = torch.stack([torch.zeros_like(angles), angles.sin(), -angles.cos()], 1)
+    return every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
+
+
+def grasps_in_world(
+    predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], request: GraspRequest,
+    wanted: Constraints, directions: Directions | Float[Tensor, "k 3"] = "all",
+) -> GraspBatch:
+    """Grasps as the predictor returns them for the same request and constraints, the best first; their frame is the world's.
+
+    The object's z axis points up, and constraints are in the world's frame. Where these want no palm direction, each of those
+    that are given, unit vectors in the world, gets a request of its own, with its share of the grasps.
+    """
+    T = torch.from_numpy(T_world_object).float()
+    problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))
+    problems, requests = [problem], [request]
+    if not isinstance(directions, str) or directions == "paper":
+        asked = paper_directions(request.num) if isinstance(directions, str) else directions[:request.num]
+        problems = [replace(problem, constraints=replace(problem.constraints, direction=(x, y, z)))
+                    for x, y, z in (asked @ T[:3, :3]).tolist()]
+        seeds = np.random.default_rng(request.seed).integers(2**31, size=len(problems)).tolist()
+        shares = [request.num * (i + 1) // len(problems) - request.num * i // len(problems) for i in range(len(problems))]
+        requests = [replace(request, num=num, seed=seed) for num, seed in zip(shares, seeds, strict=True)]
+
+    def made(problem: GraspProblem, request: GraspRequest) -> GraspBatch | None:
+        try:
+            return predictor.run(problem, request).grasps
+        except NoGraspError:
+            return None
+
+    # Alone, a request uses all threads itself.
+    parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
+    found = [grasps for grasps in parts if grasps is not None]
+    if not found:
+        return GraspBatch.none(hand, obj)
+    ranked = GraspBatch.concatenate(found).sorted_by_score()
+    return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)

@@ -16,12 +16,12 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dro_grasp.arm.candidates import lowest_points
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 
 TURNED = 0.12  # Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)
@@ -74,20 +74,16 @@ class ReachConfig(Checked):
 class Feasible:
     """A grasp with the arm's configurations for it."""
 
-    index: int
-    """Of the grasp in its batch."""
-    approach: Float[np.ndarray, "k n_arm"]
-    """From the standoff to the grasp [rad or m]."""
-    lift: Float[np.ndarray, "m n_arm"]
-    """From the grasp upwards [rad or m]."""
+    index: int  # Of the grasp in its batch
+    approach: Float[np.ndarray, "k n_arm"]  # From the standoff to the grasp [rad or m]
+    lift: Float[np.ndarray, "m n_arm"]  # From the grasp upwards [rad or m]
 
 
 @dataclass(frozen=True)
 class Postures:
     """Independent joints of the hand in one grasp [rad or m]."""
 
-    opened: Float[np.ndarray, " n_dof"]
-    """While the arm travels."""
+    opened: Float[np.ndarray, " n_dof"]  # While the arm travels
     pregrasp: Float[np.ndarray, " n_dof"]
     grasp: Float[np.ndarray, " n_dof"]
     squeeze: Float[np.ndarray, " n_dof"]
@@ -262,6 +258,12 @@ def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int 
     away = torch.where(directions[:, 2] < STEEPEST, away, torch.inf)
     near = directions[away.topk(64, largest=False).indices]
     return near[farthest_points(near, 8)]
+
+
+def lowest_points(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
+    """Height of the hand's lowest point in pregrasp, grasp and squeeze of complete grasps [m]."""
+    postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
+    return torch.stack([hand.points(q, grasps.T_object_wrist)[..., 2].amin(-1) for q in postures]).amin(0)
 
 
 def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -40,26 +40,19 @@ TURN = np.pi  # Planned motions stay this near home, so that configurations a wh
 class CameraMount:
     """A depth camera that stands still. Its z axis points forward, x right and y down."""
 
-    T_world_camera: Float[np.ndarray, "4 4"]
-    """Pose [m]."""
-    intrinsics: Float[np.ndarray, "3 3"]
-    """Focal lengths and principal point [pixels]."""
-    width: int = 640
-    """[pixels]"""
-    height: int = 480
-    """[pixels]"""
+    T_world_camera: Float[np.ndarray, "4 4"]  # Pose [m]
+    intrinsics: Float[np.ndarray, "3 3"]  # Focal lengths and principal point [pixels]
+    width: int = 640  # [pixels]
+    height: int = 480  # [pixels]
 
 
 @dataclass(frozen=True)
 class Table:
     """A level rectangle that everything stands on."""
 
-    height: float = 0.0
-    """z of its upper side in the world [m]."""
-    centre: tuple[float, float] = (0.45, 0.0)
-    """Its middle in the world [m]."""
-    size: tuple[float, float] = (1.2, 1.4)
-    """Extent along x and y [m]."""
+    height: float = 0.0  # z of its upper side in the world [m]
+    centre: tuple[float, float] = (0.45, 0.0)  # Its middle in the world [m]
+    size: tuple[float, float] = (1.2, 1.4)  # Extent along x and y [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,11 +187,7 @@ def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
 
 
 def locate_robot(name: str | Path) -> Path:
-    """The file of a built-in robot, or the path that is given.
-
-    Raises:
-        RobotError: There is neither.
-    """
+    """The file of a built-in robot, or the path that is given."""
     path, builtin = given_path(name), BUILTIN_ROBOTS / f"{name}.yaml"
     if "/" not in str(name) and builtin.is_file():
         return builtin

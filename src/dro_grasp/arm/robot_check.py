@@ -109,11 +109,7 @@ def check_robot(name: str | Path) -> RobotReport:
 
 
 def draw_robot(robot: Robot, path: Path) -> None:
-    """Write a PNG of the robot at home, its table, and where its camera looks.
-
-    Raises:
-        OutputError: The path cannot be written.
-    """
+    """Write a PNG of the robot at home, its table, and where its camera looks."""
     meshes = [*robot_meshes(robot, robot.home, robot.open_hand), *table_meshes(robot.table)]
     if robot.camera is not None:
         T = robot.camera.T_world_camera

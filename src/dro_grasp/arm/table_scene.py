@@ -31,12 +31,9 @@ FEWEST = 60  # Fewest points of an object (ours)
 class Sight:
     """What a camera sees on a table."""
 
-    points: Float[np.ndarray, "n 3"]
-    """Points of the object that is wanted, in the frame in which they were given [m]."""
-    others: Float[np.ndarray, "m 3"]
-    """Points of other things on the table, in the world [m]."""
-    table_height: float
-    """Height of the fitted plane in the middle of the table [m]."""
+    points: Float[np.ndarray, "n 3"]  # Points of the object that is wanted, in the frame in which they were given [m]
+    others: Float[np.ndarray, "m 3"]  # Points of other things on the table, in the world [m]
+    table_height: float  # Height of the fitted plane in the middle of the table [m]
     places: Float[np.ndarray, "k 2"]
     """Where things stand on the table, the one with most points first: x and y in the world [m]."""
 
@@ -164,11 +161,7 @@ def sort_out(
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
-    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m].
-
-    Raises:
-        ObjectError: There is none.
-    """
+    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m]."""
     plane = largest_plane(points, THICKNESS / 2, 0.2, fits=3)
     if plane is None or (np.abs(points @ plane[:3] - plane[3]) < THICKNESS / 2).sum() < FEWEST:
         raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")

@@ -1,31 +1,369 @@
-"""The experiment: many attempts on many objects, stored as they come, resumable, with rates and where attempts end."""
+"""The experiment: attempts to lift objects, each from the depth image to the shaken object; stored as they come, with rates.
+
+In one attempt an object comes to rest on the table, is seen, planned for, grasped, lifted, held and shaken.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 import multiprocessing
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import mujoco
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
-from dro_grasp.arm.attempts import Attempt, TabletopConfig, Watcher, attempt
-from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.robot import load_robot
-from dro_grasp.arm.table_scene import PickedObject
+from dro_grasp.arm.motion import STAGES, MotionPlan
+from dro_grasp.arm.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
+from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.reachability import ReachConfig
+from dro_grasp.arm.robot import CameraMount, Robot, Table, load_robot
+from dro_grasp.arm.table_scene import PickedObject, pick_object
+from dro_grasp.arm.workcell import ARM, Workcell, moved
 from dro_grasp.devices import one_thread
-from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.errors import DroGraspError, GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder, reading, replacing
+from dro_grasp.geometry.se3 import random_rotations
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
+from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.scan import depth_points
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.simulation.scene import PREFIX
+
+LABEL = "tabletop/3 "
+"""Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
+APART = 0.03  # Distance between the outlines of objects as they are put down [m] (ours)
+STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
+
+Region = tuple[float, float, float, float]  # Least x and y, greatest x and y, from the arm's base [m]
+
+
+@dataclass(frozen=True)
+class TabletopConfig(Checked):
+    """How an attempt runs. Values without a source are ours."""
+
+    see: Literal["cloud", "mesh"] = "cloud"
+    """What is planned for: the cloud of the robot's camera alone, or, as a control, the true mesh at its true place."""
+    noise: float = 0.0015
+    """Standard deviation of depth [m]."""
+    region: Region = (0.38, -0.18, 0.58, 0.18)
+    """Where objects are put, from corner to corner about the arm's base [m]."""
+    clutter: int = 0
+    """Other objects, drawn from the built-in ones, that stand around the one that is asked for."""
+    segment: Literal["cluster", "mask"] = "cluster"
+    """How its points are told from those of others: by distance, from a place near its middle, or by its true mask."""
+    hold_seconds: float = 3.0
+    """How long the object is held [s]."""
+    shake_seconds: float = 2.0
+    """How long it is shaken then [s]."""
+    plan: PlanConfig = field(default_factory=PlanConfig)
+    """How motions are planned."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be set up.
+
+        Raises:
+            OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
+                on places.
+        """
+        super().__post_init__()
+        wanted = self.plan.constraints
+        if wanted.obstacles is not None or wanted.contact_region or wanted.keep_out:
+            raise OptionError("objects of attempts come to rest anywhere, so that obstacles, contact_region and keep_out say "
+                              "nothing there; leave them out, or use dro_grasp.plan for one object in its place")
+        if not 0 <= self.noise < math.inf:
+            raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
+        x, y, far_x, far_y = self.region
+        if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
+            raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
+        if not 0 <= self.clutter <= 8:  # there is no room for more
+            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to 8")
+
+    def label(self) -> str:
+        """Version and every setting, as stored with results: results of other settings are not mixed."""
+        return LABEL + json.dumps(asdict(self), sort_keys=True)
+
+    @staticmethod
+    def from_label(label: str) -> TabletopConfig:
+        """The settings that a label states.
+
+        Raises:
+            OptionError: They are of another version.
+        """
+        def with_tuples(values: dict[str, Any]) -> dict[str, Any]:
+            return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+        try:
+            values = json.loads(label.removeprefix(LABEL), object_hook=with_tuples)
+            plan = values.pop("plan")
+            plan["reach"], plan["constraints"] = ReachConfig(**plan["reach"]), Constraints(**plan["constraints"])
+            plan["deviations"] = tuple(Deviation(**deviation) for deviation in plan["deviations"])
+            return TabletopConfig(**values, plan=PlanConfig(**plan))
+        except (ValueError, TypeError, KeyError) as error:
+            raise OptionError(f"the attempt was made by another version of dro-grasp ({label.split(' ')[0]}), and cannot be "
+                              "repeated; run `dro-grasp tabletop` again") from error
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What became of one attempt; plain values."""
+
+    robot: str
+    object: str
+    number: int
+    """Of the attempt with this object."""
+    seed: int
+    settings: str
+    """See `TabletopConfig.label`."""
+    success: bool = False
+    stage: str = "see"
+    """Where it ended: see, plan, one of the motion's stages, hold, shake, or done."""
+    reason: str = ""
+    """Why it failed."""
+    place: str = "[]"
+    """JSON: the object's pose at rest in the world [m]."""
+    raised: float = 0.0
+    """How much higher the object was at the end than at rest [m]."""
+    score: float = float("nan")
+    """Of the grasp."""
+    grasps: int = 0
+    """Grasps to choose from."""
+    dropped: str = "{}"
+    """JSON: how many were dropped, by reason."""
+    see_seconds: float = 0.0
+    """From the depth image to the object's cloud [s]."""
+    plan_seconds: float = 0.0
+    """From the cloud to the timed plan [s]."""
+    grasp_seconds: float = 0.0
+    """Of these, for proposing and refining grasps [s]."""
+    processor_seconds: float = 0.0
+    """Of one core, from the depth image to the timed plan [s]; the others are by the clock, whatever else runs."""
+    motion_seconds: float = 0.0
+    """Duration of the planned motion [s]."""
+    pushed: float = 0.0
+    """Farthest that one of the other objects was moved [m]."""
+    robot_file: str = ""
+    """Name or file that the robot was loaded from."""
+    object_file: str = ""
+    """The same of the object."""
+    weights: str = ""
+    """The same of the weights."""
+    robot_sha256: str = ""
+    """Hash of the robot, of its arm and hand; empty, as the following, where attempts are made one by one."""
+    object_sha256: str = ""
+    weights_sha256: str = ""
+    solid_sha256: str = ""
+    """Hash of what was simulated of the object; one mesh may have other convex parts."""
+
+
+class Watcher:
+    """Is told what happens in an attempt; does nothing with it by itself."""
+
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """There is a plan for what was seen."""
+
+    def moved(self, scene: LiftScene) -> None:
+        """Time has passed; called at least fifty times a second of simulated time."""
+
+
+def attempt(
+    robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
+    watch: Watcher | None = None, proposer: Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch] | None = None,
+) -> Attempt:
+    """Run one attempt from beginning to end; each number draws another place of the object.
+
+    Args:
+        proposer: Makes complete grasps with scores, in the world, of what was seen, the pose of its frame and a seed, instead
+            of the predictor.
+
+    Raises:
+        OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
+    """
+    config = config or TabletopConfig()
+    _check(robot, obj, config)
+    others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
+    scene = LiftScene(Workcell(robot), [obj, *others])
+    result = Attempt(robot.name, obj.name, number, seed, config.label())
+    draw = np.random.default_rng([seed, number])
+    if not scatter(scene, config.region, draw):
+        return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
+    start, *beside = (scene.pose(i) for i in range(len(scene.objects)))
+    result = replace(result, place=json.dumps(start.round(6).tolist()))
+    begin, processor = time.perf_counter(), time.process_time()
+    try:
+        seen, T = _see(scene, config, int(draw.integers(2**31)))
+        see_seconds = time.perf_counter() - begin
+        result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
+        grasps = None if proposer is None else proposer(seen, T, seed + number)
+        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps)
+    except DroGraspError as error:
+        return replace(result, reason=str(error))
+    notes = made.notes
+    result = replace(
+        result, processor_seconds=time.process_time() - processor, plan_seconds=time.perf_counter() - begin,
+        grasp_seconds=notes.seconds["grasps"], score=notes.score, grasps=notes.grasps, dropped=json.dumps(notes.dropped),
+        motion_seconds=made.seconds)
+    if watch is not None:
+        watch.planned(seen, made)
+    stage, reason = carry_out(scene, made, config, watch)
+    raised = float(scene.pose(0)[2, 3] - start[2, 3])
+    pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
+    return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
+
+
+def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:
+    """Let the servos follow a plan, then hold and shake; where it ended, and why if it failed."""
+    start = scene.pose(0)
+    call = None if watch is None else lambda: watch.moved(scene)
+    for stage in STAGES:
+        rows = made.part(stage)
+        for i in range(rows.start + 1, rows.stop):
+            scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
+            scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
+        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
+            return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
+    lifted = float(scene.pose(0)[2, 3] - start[2, 3])
+    if lifted < config.plan.reach.within(scene.robot).lift / 2:
+        return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
+    grip = scene.in_hand(0)
+    arm, hand = made.arm.position[-1], made.hand.position[-1]
+    for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
+        for k in range(round(seconds / TICK)):
+            target, velocity = arm.copy(), np.zeros_like(arm)
+            if stage == "shake":  # the arm's first joint, at 1.5 Hz: 2 cm at half a metre, 1.8 m/s^2 (ours)
+                phase, angle = 2 * np.pi * 1.5, 0.04
+                target[0] += angle * np.sin(phase * TICK * k)
+                velocity[0] = angle * phase * np.cos(phase * TICK * k)
+            scene.command(target, velocity, hand)
+            scene.advance(TICK, call)
+        slip = _apart(scene.in_hand(0), grip)
+        if slip > 0.05 or not scene.touched(0):  # [m] (ours)
+            return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
+    return "done", ""
+
+
+def other_objects(name: str, count: int, draw: np.random.Generator) -> list[ObjectModel]:
+    """Some of the built-in objects, without the one that is asked for."""
+    return [load_object(str(other)) for other in draw.permutation(sorted(set(BUILTIN) - {name}))[:count]]
+
+
+def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:
+    """Put all objects down, the first one in the region and others up to 10 cm around it; False if one never comes to rest."""
+    wide = (region[0] - 0.05, region[1] - 0.10, region[2] + 0.10, region[3] + 0.10)
+    return all(rest(scene, index, wide if index else region, draw) for index in range(len(scene.objects)))
+
+
+def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator) -> bool:
+    """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
+    low, high = np.array(region[:2]), np.array(region[2:])
+    table, obj = scene.robot.table or Table(), scene.objects[index]
+    assert obj.vertices is not None
+    for _ in range(20):  # it is put down anew if it rolls off the region
+        generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
+        T = np.eye(4)
+        T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
+        T[:2, 3] = _free_place(scene, index, T, region, draw)
+        T[2, 3] = table.height + 0.005 - float((obj.vertices @ T[2, :3]).min())
+        scene.place(index, T)
+        resting = False
+        for _ in range(8):  # half seconds in which it comes to rest
+            scene.advance(0.5)
+            if resting := scene.speed(index) < 0.002:
+                break
+        place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
+        if resting and (place > low - 0.05).all() and (place < high + 0.05).all():
+            return True
+    return False
+
+
+def _free_place(
+    scene: LiftScene, index: int, T: Float[np.ndarray, "4 4"], region: Region, draw: np.random.Generator
+) -> Float[np.ndarray, "2"]:
+    """Where an object in this orientation stands APART from those before it; the last place that was tried if there is none."""
+    base, outline = scene.robot.T_world_base[:2, 3], scene.objects[index].cloud @ T[:2, :3].T
+    poses = [scene.pose(i) for i in range(index)]
+    others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
+    tree, place = KDTree(np.concatenate(others)) if others else None, base
+    for _ in range(100):
+        place = base + draw.uniform(region[:2], region[2:])
+        if tree is None or tree.query(outline + place)[0].min() > APART:
+            break
+    return place
+
+
+def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:
+    """Those of the images that `depth_image` makes, whose pixels are STRIDE apart [pixels]."""
+    return camera.intrinsics / np.array([[STRIDE], [STRIDE], [1.0]])
+
+
+def depth_image(
+    scene: LiftScene, camera: CameraMount, noise: float, seed: int
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Depth along the camera's z axis [m], and which pixels show the scene's first object.
+
+    Depth is zero where nothing is near, and where the robot's model covers the view. Objects are seen as their true meshes.
+    `noise` is the standard deviation of depth [m].
+    """
+    row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
+    pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
+    rays = np.linalg.solve(camera.intrinsics, pixels.T).T
+    length = np.linalg.norm(rays, axis=1)
+    world = (rays / length[:, None]) @ camera.T_world_camera[:3, :3].T
+    groups = np.array([1, 1, 1, 0, 1, 0], np.uint8)  # true shapes in, convex parts out
+    assert groups[SHAPE_GROUP]
+    geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    eye = camera.T_world_camera[:3, 3].copy()
+    mujoco.mj_multiRay(
+        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), 3.0)
+    owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
+    robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
+    seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]
+    first = np.array([name == object_name(0) for name in owner])[np.maximum(geom, 0)] & seen
+    drawn = np.random.default_rng(seed).normal(0.0, noise, len(rays))
+    return np.where(seen, distance / length + drawn, 0.0).reshape(row.shape), first.reshape(row.shape)
+
+
+def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
+    """The object as it is known, with other things and the table that was seen; and where its frame is."""
+    robot, T, (obj, *others) = scene.robot, scene.pose(0), scene.objects
+    if config.see == "mesh":
+        return PickedObject(obj, [moved(o, scene.pose(i)) for i, o in enumerate(others, 1)], robot), T
+    camera = robot.camera
+    assert camera is not None
+    depth, mask = depth_image(scene, camera, config.noise, seed)
+    x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
+    points = depth_points(depth, thinned_intrinsics(camera))
+    known = mask[depth > 0] if config.segment == "mask" else None
+    return pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known), np.eye(4)
+
+
+def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
+
+
+def _check(robot: Robot, obj: ObjectModel, config: TabletopConfig) -> None:
+    if robot.table is None or (config.see == "cloud" and robot.camera is None):
+        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
+                          "file: attempts need both")
+    if obj.is_cloud:
+        raise OptionError(f"object '{obj.name}' is a bare cloud; attempts are simulated, and need a mesh")
 
 
 @dataclass(frozen=True)
@@ -112,11 +450,7 @@ def run_tabletop(
 def _done(
     run: TabletopRun, stored: Sequence[Attempt], output: Path | None
 ) -> tuple[dict[tuple[str, int], Attempt], dict[str, str]]:
-    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each.
-
-    Raises:
-        OptionError: Some are of another object of the name.
-    """
+    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each."""
     robot, weights, objects = load_robot(run.robot), describe_weights(run.weights)["sha256"], _objects(run.objects)
     alike = [a for a in stored if (a.robot, a.settings, a.seed) == (robot.name, run.config.label(), run.seed)]
     done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
@@ -130,11 +464,7 @@ def _done(
 
 
 def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """What each object was given as, and its hashes, by its name.
-
-    Raises:
-        OptionError: Two of them differ and have one name.
-    """
+    """What each object was given as, and its hashes, by its name."""
     found: dict[str, tuple[str, str, str]] = {}
     for source in dict.fromkeys(given):
         obj = load_object(source)
@@ -184,11 +514,7 @@ def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
 
 
 def read_attempts(path: Path) -> list[Attempt]:
-    """Read such a file.
-
-    Raises:
-        GraspFileError: It is another file.
-    """
+    """Read such a file."""
     known = {f.name for f in fields(Attempt)}
     expected = "a file of attempts; name another one, or move this one away"
     with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing

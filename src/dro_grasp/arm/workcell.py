@@ -54,8 +54,7 @@ class Contact:
 
     first: str
     second: str
-    distance: float
-    """Negative where they penetrate [m]."""
+    distance: float  # Negative where they penetrate [m]
 
     @property
     def depth(self) -> str:
@@ -150,8 +149,6 @@ class Workcell:
         """What collides.
 
         Args:
-            arm: Joints of the arm [rad or m].
-            hand: Independent joints of the hand [rad or m].
             clearance: Distance below which robot and surroundings count as colliding [m], at most CLEARANCE.
             moved: Motion of the object from where it stands, in the world, if the hand carries it.
             touch: The hand may touch the object.

@@ -34,15 +34,13 @@ class Benchmark:
         "(default: auto, start, optimiser, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
     """What proposes the grasps: auto, network, optimiser, dfc, start, mean-grasp, mean-grasp-chosen; network@WEIGHTS and
     auto@WEIGHTS for other weights; module:Class for a source of yours; or a grasp file."""
-    hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
-    """Names or paths of hands."""
+    hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")  # Names or paths of hands.
     objects: tuple[str, ...] = ("builtin:test",)
     """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
     dexgraspbench: Annotated[Path | None, optional("FOLDER", "the objects above")] = None
     """Folder of a clone of DexGraspBench, or of its archive of objects: all objects in it at the official scales take the place
     of --objects."""
-    num: int = 100
-    """Grasps of each hand on each object, of which ranking keeps the best quarter."""
+    num: int = 100  # Grasps of each hand on each object, of which ranking keeps the best quarter.
     stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
         "raw", "ranked", "refined")
     """What is done to the grasps before the trials; of refined and of settled grasps, all and the best by score are reported.
@@ -50,14 +48,11 @@ class Benchmark:
     `generate --source` returns. equal-time: all methods with as much CPU time for each grasp as the first."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
-    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights of the network."""
-    device: str = "cpu"
-    """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights of the network.
+    device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
-    controls: bool = True
-    """Without --methods: also evaluate start, optimiser and, with a bundle, the mean grasp."""
+    controls: bool = True  # Without --methods: also evaluate start, optimiser and, with a bundle, the mean grasp.
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle whose grasps are averaged to the mean grasp."""
     contact_quality: Flag = False
@@ -66,12 +61,9 @@ class Benchmark:
     """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What methods, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
-    views: int = 1
-    """Views of each object for each hand, with --num grasps each."""
-    seed: int = 0
-    """The same seed gives the same grasps and views."""
-    json: Flag = False
-    """Print one JSON object instead of a Markdown table."""
+    views: int = 1  # Views of each object for each hand, with --num grasps each.
+    seed: int = 0  # The same seed gives the same grasps and views.
+    json: Flag = False  # Print one JSON object instead of a Markdown table.
 
     def run(self) -> int:
         """Load everything, measure, print."""

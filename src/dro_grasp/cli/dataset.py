@@ -1,7 +1,9 @@
-"""`dro-grasp dataset`: commands for data sets of grasps, and grasps of other projects."""
+"""`dro-grasp synthesize` and `dataset`: a grasp data set for any hand, what is done with data sets, and those of others."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +16,96 @@ from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.train.data.collections.collection import PairGrasps
+    from dro_grasp.train.data.engine.pools import Pool
+    from dro_grasp.train.data.engine.worker import Job
 
 
+@dataclass(frozen=True)
+class Synthesize:
+    """Synthesize grasps from geometry alone, and keep those that pass a trial. A rerun resumes.
+
+    Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output data
+    """
+
+    hand: tuple[str, ...]  # Names or paths of hands.
+    object: tuple[str, ...]  # Names, meshes, folders of meshes, or groups such as builtin:train and assets:validate.
+    output: Path  # Folder for the grasp files; created if missing.
+    grasps: int = 150  # Valid grasps of each hand on each object. A rerun with a larger number adds the difference.
+    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
+    """Start no new work after this time [min]. A rerun resumes."""
+    workers: int = 2  # Processes of one thread each. A running Ray cluster uses all its CPUs instead.
+    shard: Annotated[str, tyro.conf.arg(metavar="I/N", help_behavior_hint="(default: 1/1, all of them)")] = "1/1"
+    """Part of the pairs that this run fills: 3/16 is the third of sixteen. All parts may share the folder and run at once, as
+    the tasks of an array job."""
+    engine: Literal["local", "ray"] = "local"  # Processes on this machine, or a Ray cluster.
+    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
+    """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
+    device: str = "cpu"  # Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
+    scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
+    seed: int = 0  # The same seed gives the same grasps.
+    protocol: ProtocolName = "strict"  # Protocol of the trial that grasps must pass.
+    idle: float = 0.6
+    """Probability that a finger other than the thumb is not asked to touch, 0 to 1; lower makes fuller grasps, and fewer."""
+    keep_idle_fingers: Flag = False
+    """Leave idle fingers as they are. Otherwise they close onto the object where the grasp then passes as well."""
+    json: Flag = False  # Print one JSON object instead of a table.
+
+    def run(self) -> int:
+        """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
+        from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.optimize.contacts import ContactConfig
+        from dro_grasp.optimize.synthesis import SynthesisConfig
+        from dro_grasp.train.data.engine.schedule import require_distinct, require_known, synthesize_dataset
+        from dro_grasp.train.data.engine.worker import EngineConfig
+
+        self._check_numbers()
+        objects = resolve_objects(list(self.object))
+        require_known(self.hand, objects)
+        require_distinct(self.hand, objects)
+        config = EngineConfig(
+            self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
+            close_fingers=not self.keep_idle_fingers,
+            synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle)))
+        report = synthesize_dataset(
+            self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
+            config, say_aside)
+        failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
+        counts = {"grasps": report.grasps, "added": report.added, "shards": report.shards, "seconds": round(report.seconds, 2)}
+        code = 2 if failures and not report.grasps else 0
+        print_result(self.json, {"output": str(self.output), **counts, "failures": failures}, "synthesis", [*counts],
+                     [[*counts.values()]])
+        if not self.json:
+            for failure in failures:
+                say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
+            if code:
+                say_aside("error: no grasp was found, for the reasons above")
+        return code
+
+    def _check_numbers(self) -> None:
+        from dro_grasp.errors import OptionError
+
+        for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
+            if value < 1:
+                raise OptionError(f"{option} is {value}; give at least 1")
+        if self.minutes is not None and not (math.isfinite(self.minutes) and self.minutes > 0):
+            raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
+        if not 0 <= self.idle <= 1:
+            raise OptionError(f"--idle is {self.idle}; give a probability, from 0 (every finger holds) to 1")
+
+    def _part(self) -> tuple[int, int]:
+        from dro_grasp.errors import OptionError
+
+        found = re.fullmatch(r"(\d+)/(\d+)", self.shard)
+        if found is None:
+            raise OptionError(f"--shard is '{self.shard}'; give a part from 1 on, and of how many, such as 3/16")
+        return int(found[1]), int(found[2])
+
+    def _ray_pool(self, job: Job) -> Pool:
+        from dro_grasp.train.data.engine.pools import RayPool
+
+        return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)
 
 
 @dataclass(frozen=True)
@@ -27,16 +117,13 @@ class Import:
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """`cmap_dataset.pt` of the official D(R,O) release, or npy files of DexGraspNet or DexGraspBench."""
-    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
-    """Format of the files."""
-    output: Path
-    """Folder for one grasp file per hand; created if missing."""
+    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]  # Format of the files.
+    output: Path  # Folder for one grasp file per hand; created if missing.
     hands: tuple[str, ...] = ()
     """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Object of all grasps, if the file names another or none."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Read all files, find hands and objects, write grasp files."""
@@ -71,10 +158,8 @@ class Import:
 class Info:
     """Count the grasps of a data set by hand and object."""
 
-    folder: tyro.conf.Positional[Path]
-    """An output folder of `dro-grasp synthesize`, a folder of grasp files, or a grasp file."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    folder: tyro.conf.Positional[Path]  # An output folder of `dro-grasp synthesize`, a folder of grasp files, or a grasp file.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Count."""
@@ -110,10 +195,8 @@ class Report(DataSets):
     Example: dro-grasp dataset report data --output report.html
     """
 
-    output: Annotated[Path | None, optional("PATH", "no page")] = None
-    """Self-contained HTML page with charts and pictures."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    output: Annotated[Path | None, optional("PATH", "no page")] = None  # Self-contained HTML page with charts and pictures.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Measure, print, write the page."""
@@ -144,12 +227,10 @@ class Merge(DataSets):
     Example: dro-grasp dataset merge data more --output grasps --per-pair 150
     """
 
-    output: Path
-    """Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end."""
+    output: Path  # Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Merge, and write the files."""
@@ -178,18 +259,12 @@ class Check(DataSets):
     Example: dro-grasp dataset check data --sample 500
     """
 
-    sample: int = 100
-    """Grasps to evaluate, drawn uniformly from all grasps."""
-    protocol: ProtocolName = "strict"
-    """Protocol of the trial."""
-    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
-    """Friction coefficient between hand and object."""
-    mass_factor: float = 1.0
-    """Factor for the masses of the objects, and thereby for the forces."""
-    seed: int = 0
-    """Seed of the sample."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    sample: int = 100  # Grasps to evaluate, drawn uniformly from all grasps.
+    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
+    mass_factor: float = 1.0  # Factor for the masses of the objects, and thereby for the forces.
+    seed: int = 0  # Seed of the sample.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Draw, evaluate, compare."""
@@ -221,16 +296,11 @@ class Filter(DataSets):
     Example: dro-grasp dataset filter theirs.parquet --protocol strict --output kept
     """
 
-    output: Path
-    """Folder for the files, one per hand; created if missing."""
-    protocol: ProtocolName = "strict"
-    """Protocol of the trial."""
-    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
-    """Friction coefficient between hand and object."""
-    close_fingers: Flag = False
-    """Close idle fingers onto the object where the grasp still passes."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    output: Path  # Folder for the files, one per hand; created if missing.
+    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
+    close_fingers: Flag = False  # Close idle fingers onto the object where the grasp still passes.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Evaluate, and write one file per hand."""
@@ -266,19 +336,16 @@ class BundleCommand(DataSets):
     Example: dro-grasp dataset bundle data --output bundle.safetensors
     """
 
-    output: Path
-    """Bundle to write (.safetensors)."""
+    output: Path  # Bundle to write (.safetensors).
     split: Literal["train", "few_shot", "validate"] = "train"
     """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on objects that no
     weights are trained on, for measuring."""
-    hands: tuple[str, ...] = ()
-    """Hands to include; by default all."""
+    hands: tuple[str, ...] = ()  # Hands to include; by default all.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     hands_without_grasps: tuple[str, ...] = ()
     """Names or URDF files of further hands, such as those of `hand make`: `pretrain` needs their kinematics alone."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Select the grasps of the split, find their hands and objects, write the bundle."""

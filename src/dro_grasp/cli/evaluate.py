@@ -31,25 +31,20 @@ class Evaluate:
     Example: dro-grasp evaluate grasps.parquet --protocol strict
     """
 
-    file: tyro.conf.Positional[Path]
-    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
-    protocol: ProtocolName = DEFAULT_PROTOCOL
-    """The trial."""
+    file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.
+    protocol: ProtocolName = DEFAULT_PROTOCOL  # The trial.
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one named in the file."""
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use, likewise, for a file with one object."""
-    scale: float = 1.0
-    """Scale of the mesh given with --object."""
+    scale: float = 1.0  # Scale of the mesh given with --object.
     contact_quality: Flag = False
     """Also measure penetration, contact distance and force closure of the grasps as they are, without any motion: the analytic
     metrics of DexGraspBench, with the protocol's friction."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Save the grasps with their results, which must be those of the hand and the object that they were made for."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Evaluate object by object, then report."""
@@ -85,11 +80,7 @@ class Evaluate:
     def _problems(
         self, hand: Hand, grasps: GraspBatch
     ) -> tuple[list[tuple[str, GraspProblem, GraspBatch]], dict[str, GraspBatch]]:
-        """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds.
-
-        Raises:
-            ObjectError: All objects are bare clouds.
-        """
+        """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds."""
         from dro_grasp.errors import ObjectError
         from dro_grasp.grasps.sources import object_of
         from dro_grasp.predict.problem import GraspProblem
@@ -153,11 +144,7 @@ class Evaluate:
 
 
 def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:
-    """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones.
-
-    Raises:
-        OptionError: Outcomes with it are to be saved, where they would pass for those with the grasps' own.
-    """
+    """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones."""
     from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import made_for_another
 

@@ -24,23 +24,18 @@ class Export:
     Example: dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml
     """
 
-    file: tyro.conf.Positional[Path]
-    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
+    file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.
     format: Annotated[str, tyro.conf.arg(
         constructor=tyro.extras.literal_type_from_choices(FORMATS),
         help=" ".join(f"{name}: {form.explanation}." for name, form in FORMATS.items()))]
-    output: Path
-    """File to write. For dexgraspbench and for several objects: a folder, created if missing."""
+    output: Path  # File to write. For dexgraspbench and for several objects: a folder, created if missing.
     frame: Annotated[Path | None, optional("JSON", "the object's frame")] = None
     """File with {"frame": "camera", "T_frame_object": 4x4}, the frame for the exported poses."""
-    only_successful: Flag = False
-    """Export only grasps that passed their trial."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one named in the file."""
+    only_successful: Flag = False  # Export only grasps that passed their trial.
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Object to use instead, if pregrasps are missing, for a file with one object."""
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
@@ -113,11 +108,7 @@ def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
 
 
 def refuse_mixing(folder: Path, suffix: str) -> None:
-    """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new.
-
-    Raises:
-        OutputError: It holds some.
-    """
+    """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new."""
     from dro_grasp.errors import OutputError
 
     old = next((path for pattern in (f"*{suffix}", f"*/*{suffix}") for path in folder.glob(pattern)), None)

@@ -35,16 +35,11 @@ class Generate:
     Example: dro-grasp generate --hand allegro --object mug --output grasps.parquet --picture grasps.png
     """
 
-    hand: str
-    """A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file."""
-    object: str
-    """An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them."""
-    num: int = 16
-    """How many grasps of each object."""
-    candidates: int = 4
-    """Candidates proposed for each grasp kept; the best by score are kept. 1 is quickest."""
-    seed: int = 0
-    """The same seed gives the same grasps."""
+    hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.
+    object: str  # An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them.
+    num: int = 16  # How many grasps of each object.
+    candidates: int = 4  # Candidates proposed for each grasp kept; the best by score are kept. 1 is quickest.
+    seed: int = 0  # The same seed gives the same grasps.
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
     """In the object's frame, or in the one that --camera names."""
     table: Annotated[float | None, optional("Z", "no table")] = None
@@ -59,18 +54,15 @@ class Generate:
     """What proposes candidates: network; optimiser, which also makes training data (any hand, nothing learned); auto, the
     network, and the optimiser for the grasps with which the score does not trust it; module:Class, a source of yours; or a
     grasp file."""
-    refine: bool = True
-    """Refine the candidates on the object's geometry, near where the network proposed them."""
+    refine: bool = True  # Refine the candidates on the object's geometry, near where the network proposed them.
     keep_table: Flag = False
     """Take every point of a cloud for the object's. By default a table in it is found and cut off, and hands stay above it."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
-    scale: float = 1.0
-    """Multiplies the object's coordinates; 0.001 for files in millimetres."""
+    scale: float = 1.0  # Multiplies the object's coordinates; 0.001 for files in millimetres.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
-    device: str = "cpu"
-    """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
+    device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
     protocol: Annotated[
         ProtocolName | Literal["none"] | None,
         optional(f"{{{','.join(PROTOCOLS)},none}}", f"{DEFAULT_PROTOCOL} for a mesh, none for a bare point cloud"),
@@ -82,10 +74,8 @@ class Generate:
     """Parquet file for the grasps; with a folder of objects, an existing folder that gets one file an object."""
     picture: Annotated[Path | None, optional("PNG", "no picture")] = None
     """Picture of the best grasps; with a folder of objects, an existing folder."""
-    view: Flag = False
-    """Open the viewer on the result."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    view: Flag = False  # Open the viewer on the result.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
@@ -263,21 +253,17 @@ class Job:
     request: GraspRequest
     constraints: Constraints
     camera: NamedMotion | None
-    seconds: dict[str, float]
-    """Time to start, most of which goes to loading libraries, and to load hand and weights [s]."""
+    seconds: dict[str, float]  # Time to start, most of which goes to loading libraries, and to load hand and weights [s].
 
 
 @dataclass(frozen=True)
 class ObjectResult:
     """The grasps of one object."""
 
-    report: dict[str, Any]
-    """The JSON object."""
+    report: dict[str, Any]  # The JSON object.
     obj: ObjectModel
-    grasps: GraspBatch
-    """The grasps that were kept."""
-    predicted_points: Float[Tensor, "n n_points 3"]
-    """Their hand points as the network placed them [m]."""
+    grasps: GraspBatch  # The grasps that were kept.
+    predicted_points: Float[Tensor, "n n_points 3"]  # Their hand points as the network placed them [m].
 
 
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:

@@ -31,18 +31,12 @@ class Make:
     Example: dro-grasp hand make --seed 0 --num 24 --output hands --picture hands.png
     """
 
-    output: Path
-    """Folder for hand_00000.urdf and so on, numbered by seed, and the listing hands.csv; created if missing."""
-    seed: int = 0
-    """Seed of the first hand; each following hand has the next one. A seed always gives the same hand."""
-    num: int = 24
-    """How many hands."""
-    picture: Annotated[Path | None, optional("PNG", "none")] = None
-    """PNG file with a picture of each hand."""
-    overwrite: Flag = False
-    """Replace files of these names, which are refused otherwise."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
+    output: Path  # Folder for hand_00000.urdf and so on, numbered by seed, and the listing hands.csv; created if missing.
+    seed: int = 0  # Seed of the first hand; each following hand has the next one. A seed always gives the same hand.
+    num: int = 24  # How many hands.
+    picture: Annotated[Path | None, optional("PNG", "none")] = None  # PNG file with a picture of each hand.
+    overwrite: Flag = False  # Replace files of these names, which are refused otherwise.
+    json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
         """Make, write, list and draw."""
@@ -123,16 +117,11 @@ class Vary:
     Example: dro-grasp hand vary leaphand --mirrored --scale 0.95 --output leap_left_small.urdf
     """
 
-    hand: tyro.conf.Positional[str]
-    """Name of a hand, or path of a URDF file."""
-    output: Path
-    """URDF file to write. It names the hand's meshes by their absolute paths."""
-    mirrored: Flag = False
-    """Mirror it: a right hand becomes a left one. Equal joint values give mirrored poses."""
-    scale: float = 1.0
-    """Factor for all lengths; masses grow with its cube."""
-    json: Flag = False
-    """Print one JSON object instead of text."""
+    hand: tyro.conf.Positional[str]  # Name of a hand, or path of a URDF file.
+    output: Path  # URDF file to write. It names the hand's meshes by their absolute paths.
+    mirrored: Flag = False  # Mirror it: a right hand becomes a left one. Equal joint values give mirrored poses.
+    scale: float = 1.0  # Factor for all lengths; masses grow with its cube.
+    json: Flag = False  # Print one JSON object instead of text.
 
     def run(self) -> int:
         """Read, change, write."""
@@ -168,8 +157,7 @@ class Check:
     """Name of a hand, or path of a URDF or MJCF file; FILE#LINK for the hand of a whole robot, by its first link."""
     picture: Annotated[Path | None, optional("PNG", "none")] = None
     """PNG file with the hand open and closed, its palm direction and its contact links."""
-    json: Flag = False
-    """Print one JSON object instead of text."""
+    json: Flag = False  # Print one JSON object instead of text.
 
     def run(self) -> int:
         """Check, print, draw."""

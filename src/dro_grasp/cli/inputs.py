@@ -38,11 +38,7 @@ class PalmOptions:
     """Least distance [m] between the object and every link that closes, in pregrasp."""
 
     def constraints(self, table: float | None = None, obstacles: Scene | None = None) -> Constraints:
-        """These options, with a table's height [m] and what stands around.
-
-        Raises:
-            OptionError: Something cannot be respected.
-        """
+        """These options, with a table's height [m] and what stands around."""
         from dro_grasp.predict.constraints import Constraints
 
         return Constraints(table=table, obstacles=obstacles, **asdict(self))
@@ -54,5 +50,4 @@ class ConstraintOptions(PalmOptions):
 
     contact_region: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
     """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
-    keep_out: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
-    """Balls [m] that the hand stays out of."""
+    keep_out: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()  # Balls [m] that the hand stays out of.

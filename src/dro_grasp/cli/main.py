@@ -13,20 +13,17 @@ import tyro
 
 from dro_grasp._version import __version__
 from dro_grasp.cli.benchmark import Benchmark
-from dro_grasp.cli.dataset import Dataset
+from dro_grasp.cli.dataset import Dataset, Synthesize
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
-from dro_grasp.cli.listing import Hands, Objects
+from dro_grasp.cli.listing import Hands, Objects, Weights
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.output import say_aside
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
-from dro_grasp.cli.serve import Serve
-from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
-from dro_grasp.cli.view import Picture, View
-from dro_grasp.cli.weights import Weights
+from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.kinds import FORMER_CONSTRAINTS, FORMER_SOURCES
 
@@ -129,11 +126,7 @@ def parse(arguments: Sequence[str]) -> Any:
 
 
 def without_threads(arguments: Sequence[str]) -> list[str]:
-    """The arguments without `--threads N`, which is set for this process and those that it starts.
-
-    Raises:
-        OptionError: N is no number, or less than 1.
-    """
+    """The arguments without `--threads N`, which is set for this process and those that it starts."""
     rest = [word for argument in arguments for word in argument.split("=", int(argument.startswith("--threads=")))]
     if "--threads" in rest:
         place = rest.index("--threads")

@@ -19,30 +19,20 @@ class Onboard:
     Example: dro-grasp onboard my_hand.urdf --output my_hand --minutes 30
     """
 
-    hand: tyro.conf.Positional[str]
-    """Path of a URDF or MJCF file, or name of a hand."""
-    output: Path
-    """Folder for data, weights and report. A rerun resumes there."""
-    objects: tuple[str, ...] = ("builtin:train",)
-    """Objects to synthesize grasps of: names, meshes, folders or groups."""
-    held_out: tuple[str, ...] = ("builtin:test",)
-    """Objects to evaluate the weights on, never used in training."""
-    minutes: float = 30.0
-    """Total time for data, training and trials [min]."""
-    num: int = 20
-    """Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns."""
-    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights to fine-tune."""
+    hand: tyro.conf.Positional[str]  # Path of a URDF or MJCF file, or name of a hand.
+    output: Path  # Folder for data, weights and report. A rerun resumes there.
+    objects: tuple[str, ...] = ("builtin:train",)  # Objects to synthesize grasps of: names, meshes, folders or groups.
+    held_out: tuple[str, ...] = ("builtin:test",)  # Objects to evaluate the weights on, never used in training.
+    minutes: float = 30.0  # Total time for data, training and trials [min].
+    num: int = 20  # Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns.
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights to fine-tune.
     source: str = "auto"
     """Source of the grasps that `generate` returns in benchmarks and report: as `generate --source`."""
     device: str = "cpu"
     """Device for the network, its training and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
-    workers: int = 2
-    """Processes that synthesize grasps."""
-    seed: int = 0
-    """Seed of data, training and trials."""
-    json: Flag = False
-    """Print one JSON object at the end."""
+    workers: int = 2  # Processes that synthesize grasps.
+    seed: int = 0  # Seed of data, training and trials.
+    json: Flag = False  # Print one JSON object at the end.
 
     def run(self) -> int:
         """Run all steps, then write the report."""

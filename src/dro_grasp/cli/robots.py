@@ -13,12 +13,15 @@ from dro_grasp.cli.inputs import ConstraintOptions, Flag, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from jaxtyping import Float
 
-    from dro_grasp.arm.attempts import Attempt
+    from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.arm.robot import Robot
     from dro_grasp.arm.table_scene import PickedObject
+    from dro_grasp.arm.tabletop import Attempt
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,7 @@ class Plan:
     Example: dro-grasp plan --robot xarm7_leaphand --object mug --at 0.5 0.1 --output plan.npz --trajectory plan.yaml
     """
 
-    robot: str
-    """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
+    robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
     object: str
     """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may
     show the table and other things too."""
@@ -43,38 +45,30 @@ class Plan:
     near: Annotated[tuple[float, float] | None, optional("X Y", "there is only one")] = None
     """The object is a cloud of a table with several things: take the one nearest to this place in the world [m], and keep clear
     of the others."""
-    obstacles: tuple[str, ...] = ()
-    """Clouds and meshes of things, in the world frame, that nothing may touch."""
+    obstacles: tuple[str, ...] = ()  # Clouds and meshes of things, in the world frame, that nothing may touch.
     scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, of any size, in the world frame and without object and robot: hand and arm stay
     clear of it."""
-    constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
-    """In the world frame."""
-    num: int = 24
-    """Grasps to choose from, in each of up to three batches."""
-    top: int = 5
-    """Reachable grasps of best score that are given to the planner at once."""
+    constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
+    num: int = 24  # Grasps to choose from, in each of up to three batches.
+    top: int = 5  # Reachable grasps of best score that are given to the planner at once.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
-    planner_seconds: float = 3.0
-    """Longest time for one path [s]."""
-    seed: int = 0
-    """Of grasps, inverse kinematics and planner."""
+    planner_seconds: float = 3.0  # Longest time for one path [s].
+    seed: int = 0  # Of grasps, inverse kinematics and planner.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     output: Annotated[Path | None, optional("NPZ", "not saved")] = None
     """Plan file: arm and hand over time, by stage, and what was dropped."""
     trajectory: Annotated[Path | None, optional("YAML", "not written")] = None
     """The motion as trajectory_msgs/JointTrajectory, one for the arm and one for the hand."""
-    csv: Annotated[Path | None, optional("CSV", "not written")] = None
-    """The motion as a table."""
-    json: Flag = False
-    """Print one JSON object instead of text."""
+    csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
+    json: Flag = False  # Print one JSON object instead of text.
 
-    def run(self) -> int:
-        """Check everything that can be checked before the work, then plan and write."""
+    def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
+        """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
         from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
         from dro_grasp.arm.planner import PlanConfig, plan
         from dro_grasp.arm.robot import load_robot
@@ -107,7 +101,7 @@ class Plan:
                       "`table` in the robot file")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
         if self.output is not None:
             made.save(self.output)
         for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
@@ -186,22 +180,15 @@ class Tabletop:
     Example: dro-grasp tabletop --robot xarm7_leaphand --objects mug can --attempts 2 --output results.parquet
     """
 
-    robot: str
-    """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
-    objects: tuple[str, ...]
-    """Names or files of meshes, `all`, or `assets:validate`."""
-    attempts: int = 10
-    """With each object, each at another place and in another pose."""
+    robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
+    objects: tuple[str, ...]  # Names or files of meshes, `all`, or `assets:validate`.
+    attempts: int = 10  # With each object, each at another place and in another pose.
     see: Literal["cloud", "mesh"] = "cloud"
     """What is planned for: the robot's camera's cloud alone, or, as a control, the true mesh at its true place."""
-    order: Literal["score", "random"] = "score"
-    """Which reachable grasps are taken: the best by score, or, as a control, any."""
-    directions: Literal["paper", "all"] = "all"
-    """Palm directions: `paper`, from above to the right side, or `all`."""
-    constraints: PalmOptions = field(default_factory=PalmOptions)
-    """In the world frame."""
-    num: int = 24
-    """Grasps to choose from, in each of up to three batches."""
+    order: Literal["score", "random"] = "score"  # Which reachable grasps are taken: the best by score, or, as a control, any.
+    directions: Literal["paper", "all"] = "all"  # Palm directions: `paper`, from above to the right side, or `all`.
+    constraints: PalmOptions = field(default_factory=PalmOptions)  # In the world frame.
+    num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
     region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
@@ -210,14 +197,11 @@ class Tabletop:
     """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
     """How the object's points are told from those of others: by distance, or by its true mask."""
-    noise: float = 0.0015
-    """Standard deviation of the camera's depth [m]."""
-    seed: int = 0
-    """Of all draws."""
+    noise: float = 0.0015  # Standard deviation of the camera's depth [m].
+    seed: int = 0  # Of all draws.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
-    workers: int = 1
-    """Processes; each takes one object after the other."""
+    workers: int = 1  # Processes; each takes one object after the other.
     output: Annotated[Path | None, optional("PARQUET", "not saved")] = None
     """A row for each attempt, with stage, reason, times and seed. Attempts that it holds with the same robot, objects, weights,
     settings and seed are not repeated."""
@@ -225,18 +209,16 @@ class Tabletop:
     """Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz."""
     video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None
     """Animation of the first attempt, which is run once more for it."""
-    json: Flag = False
-    """Print one JSON object instead of text."""
+    json: Flag = False  # Print one JSON object instead of text.
 
-    def run(self) -> int:
-        """Run what is missing, store and print."""
+    def run(self, make: Callable[..., Attempt] | None = None) -> int:
+        """Run what is missing, or make it in another way, store and print."""
         from dro_grasp.extras import require_extra
 
         require_extra("arm")
         from dro_grasp.arm.animation import FORMATS, draw_attempt
-        from dro_grasp.arm.attempts import TabletopConfig
         from dro_grasp.arm.planner import PlanConfig
-        from dro_grasp.arm.tabletop import TabletopRun, run_tabletop
+        from dro_grasp.arm.tabletop import TabletopConfig, TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
@@ -249,7 +231,7 @@ class Tabletop:
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
-        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)
+        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans, make)
         self._report(done)
         if self.video is not None:
             draw_attempt(run, self.video)
@@ -294,12 +276,10 @@ class CheckRobot:
     Example: dro-grasp robot check robot.yaml --picture robot.png
     """
 
-    robot: tyro.conf.Positional[str]
-    """A robot file, or the name of a built-in robot."""
+    robot: tyro.conf.Positional[str]  # A robot file, or the name of a built-in robot.
     picture: Annotated[Path | None, optional("PNG", "none")] = None
     """PNG file with the robot at home, its table, and where its camera looks."""
-    json: Flag = False
-    """Print one JSON object instead of text."""
+    json: Flag = False  # Print one JSON object instead of text.
 
     def run(self) -> int:
         """Check, print, draw."""
@@ -319,8 +299,7 @@ class CheckRobot:
 class Robots:
     """List the built-in robots. Any other is a robot file."""
 
-    json: Flag = False
-    """Print one JSON object."""
+    json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
         """Print the names."""

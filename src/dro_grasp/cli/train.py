@@ -21,12 +21,9 @@ if TYPE_CHECKING:
 class Stage:
     """Options of both stages of training."""
 
-    bundle: Path
-    """Bundle from `dro-grasp dataset bundle`."""
-    run_folder: Path
-    """Folder for log and checkpoints; created if missing. A run in it is resumed."""
-    output: Path
-    """Weights file to write."""
+    bundle: Path  # Bundle from `dro-grasp dataset bundle`.
+    run_folder: Path  # Folder for log and checkpoints; created if missing. A run in it is resumed.
+    output: Path  # Weights file to write.
     preset: Annotated[
         Literal["slim", "paper", "paper-slim", "multi"] | None,
         tyro.conf.arg(metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: multi)"),
@@ -35,29 +32,19 @@ class Stage:
     as narrow)."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
     """Weights to begin with. They decide the network; `train` keeps their hand encoder as it is."""
-    learning_rate: float = 1e-3
-    """Peak of the learning rate."""
+    learning_rate: float = 1e-3  # Peak of the learning rate.
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Time limit (of each part of pretraining); the learning rate follows steps or time, whichever is further on."""
-    shards: int = 1
-    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
-    tensorboard: Flag = False
-    """Also write the log for TensorBoard, which must be installed."""
+    shards: int = 1  # Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them.
+    tensorboard: Flag = False  # Also write the log for TensorBoard, which must be installed.
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
     """Where to compute: cpu, cuda, or cuda:1."""
-    seed: int = 0
-    """Seed of everything."""
-    json: Flag = False
-    """Print one JSON object at the end."""
-    former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)
-    """Options that are no longer a choice, and the values that were given."""
+    seed: int = 0  # Seed of everything.
+    json: Flag = False  # Print one JSON object at the end.
+    former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)  # Options of `FORMER_OPTIONS` that were given.
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
-        """The configuration of the preset, else of the initial weights, else of `multi`.
-
-        Raises:
-            OptionError: A former option asks for something else than there is.
-        """
+        """The configuration of the preset, else of the initial weights, else of `multi`."""
         from dro_grasp.errors import OptionError
         from dro_grasp.network.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
@@ -74,11 +61,7 @@ class Stage:
         return network
 
     def schedule(self, **more: Any) -> ScheduleConfig:
-        """The schedule, which can be carried out here.
-
-        Raises:
-            OptionError: It cannot.
-        """
+        """The schedule, which can be carried out here."""
         from dro_grasp.devices import choose_device
         from dro_grasp.train.config import ScheduleConfig
         from dro_grasp.train.runs import check_schedule
@@ -97,8 +80,7 @@ class Pretrain(Stage):
     Example: dro-grasp pretrain --bundle bundle.safetensors --run-folder runs/pre --output pretrained.safetensors
     """
 
-    steps: int = 3000
-    """Optimiser steps."""
+    steps: int = 3000  # Optimiser steps.
     motion_steps: int = 5000
     """Optimiser steps of the motion, which is learned after the encoder, in its own folder in the run folder."""
 
@@ -160,26 +142,20 @@ class Train(Stage):
     grasps (steps of 96, hands by the square root of their grasps). Options of losses, samples and columns do not apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
-    steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None
-    """Optimiser steps."""
+    steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None  # Optimiser steps.
     losses: Literal["ours", "release"] = "ours"
     """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
     divergence: Annotated[float | None, optional("WEIGHT", "0.01")] = None
     """KL weight; a lower value lets z carry more information."""
-    samples_per_hand: int = 4
-    """Grasps of each of the four hands in a shard."""
+    samples_per_hand: int = 4  # Grasps of each of the four hands in a shard.
     by_count: float = 0.0
     """Draw hands in proportion to the number of their grasps to this power; 0: each as often as any other."""
-    columns: int = 48
-    """Object points to which a step predicts distances; a GPU affords 128."""
-    mixed: Flag = False
-    """Multiply in bfloat16 in encoders and transformers; for GPUs."""
-    partial: float = 0.0
-    """Share of samples with half of the object cut away."""
+    columns: int = 48  # Object points to which a step predicts distances; a GPU affords 128.
+    mixed: Flag = False  # Multiply in bfloat16 in encoders and transformers; for GPUs.
+    partial: float = 0.0  # Share of samples with half of the object cut away.
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
     """Bundle of grasps that are not trained on; the weights' distance errors on them are reported in the end."""
-    validation_samples: int = 400
-    """Validation grasps of each hand."""
+    validation_samples: int = 400  # Validation grasps of each hand.
 
     def run(self) -> int:
         """Train and save."""

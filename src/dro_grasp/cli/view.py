@@ -1,7 +1,9 @@
-"""`dro-grasp view` and `dro-grasp picture`: the grasps of a file in the browser, or on one sheet."""
+"""`dro-grasp view`, `picture` and `serve`: grasps in the browser, on one sheet, and for a robot over HTTP."""
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from threading import Lock
 
-    from dro_grasp.apps.viewer.scene_view import Client
+    from dro_grasp.apps.viewer.scene_view import Client, ServedPage
     from dro_grasp.apps.viewer.studio import Studio
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
@@ -38,23 +40,18 @@ class View:
     """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to show first: a name in the file, or a mesh to use for the file's only object; without a file, any object."""
-    scale: float = 1.0
-    """Factor for the coordinates of the mesh given with --object."""
-    port: int = 8080
-    """Port to serve on; if it is taken, the next free one."""
-    host: str = "127.0.0.1"
-    """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network."""
-    attempt: int = 0
-    """Which of the attempts in the file to run once more and show first."""
+    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
+    port: int = 8080  # Port to serve on; if it is taken, the next free one.
+    host: str = "127.0.0.1"  # Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network.
+    attempt: int = 0  # Which of the attempts in the file to run once more and show first.
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Robot to use instead of the one named in a plan or an attempt."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights, or the attempts' own")] = None
     """Weights for grasps generated on the page, or to use instead of those that attempts were made with."""
-    device: str = "cpu"
-    """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
+    device: str = "cpu"  # Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1.
 
-    def run(self) -> int:
-        """Serve the page, with the grasps of the file if there is one."""
+    def run(self, show: Callable[[ServedPage], None] | None = None) -> int:
+        """Serve the page, or show it in another way, with the grasps of the file if there is one."""
         from dro_grasp.extras import require_extra
 
         require_extra("apps")
@@ -64,11 +61,11 @@ class View:
             require_extra("arm")
             from dro_grasp.apps.viewer.lift_page import lift_page
 
-            serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
+            (show or serve)(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
         from dro_grasp.apps.viewer.studio import StudioServer
 
-        serve(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host))
+        (show or serve)(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host))
         return 0
 
     def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:
@@ -116,30 +113,20 @@ class Picture:
     Example: dro-grasp picture grasps.parquet --output sheet.png --opacity 0.5 --contacts
     """
 
-    file: tyro.conf.Positional[Path]
-    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
-    output: Path
-    """PNG file to write."""
-    count: int = 16
-    """Limit of grasps drawn, from the first on."""
-    columns: int = 4
-    """Pictures side by side."""
-    size: tuple[int, int] = (320, 280)
-    """Width and height of one picture [pixels], at most 4096 each."""
-    opacity: float = 1.0
-    """Opacity of the object; below 1 the hand shows through it."""
-    contacts: Flag = False
-    """Mark contacts in red."""
+    file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.
+    output: Path  # PNG file to write.
+    count: int = 16  # Limit of grasps drawn, from the first on.
+    columns: int = 4  # Pictures side by side.
+    size: tuple[int, int] = (320, 280)  # Width and height of one picture [pixels], at most 4096 each.
+    opacity: float = 1.0  # Opacity of the object; below 1 the hand shows through it.
+    contacts: Flag = False  # Mark contacts in red.
     posture: Literal["held", "grasp"] = "held"
     """Draw hand and object after the hand has closed, or the grasp from which it closes."""
-    only_successful: Flag = False
-    """Draw only grasps that passed their trial."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one named in the file."""
+    only_successful: Flag = False  # Draw only grasps that passed their trial.
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "every object in the file")] = None
     """Object to draw: a name in the file, or a mesh to use for the file's only object. Several objects share the sheet."""
-    scale: float = 1.0
-    """Factor for the coordinates of the mesh given with --object."""
+    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
 
     def run(self) -> int:
         """Load the file and draw."""
@@ -154,7 +141,7 @@ class Picture:
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
-        pairs = self._pairs(grasps)
+        pairs = self.pairs(grasps)
         shown = sum(len(own) for _, own in pairs)
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
@@ -164,7 +151,7 @@ class Picture:
         say(f"picture: {self.output}")
         return 0
 
-    def _pairs(self, grasps: GraspBatch) -> list[tuple[ObjectModel, GraspBatch]]:
+    def pairs(self, grasps: GraspBatch) -> list[tuple[ObjectModel, GraspBatch]]:
         """Objects on the sheet, each with those of its grasps that are drawn."""
         from dro_grasp.errors import GraspFileError
 
@@ -193,6 +180,51 @@ class Picture:
             raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
 
 
+TOKEN = "DRO_GRASP_TOKEN"  # Environment variable of the token, which others cannot read in a list of processes
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `[apps]`.
+
+    Example: dro-grasp serve --hand my_hand.urdf --port 8090
+    """
+
+    hand: tuple[str, ...] = ()  # Names or files of hands that are loaded at once; built-in ones can be asked for besides.
+    object: tuple[str, ...] = ()
+    """Files or folders of objects that can be asked for by their names; built-in ones, and what is sent, can be besides."""
+    host: str = "127.0.0.1"
+    """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network and needs a token."""
+    port: int = 8090  # Port to serve on.
+    token: Annotated[str | None, optional("TOKEN", "DRO_GRASP_TOKEN, or none")] = None
+    """What requests must bear: the header `Authorization: Bearer TOKEN`."""
+    queue: int = 16  # Requests that may wait; more are refused.
+    time_limit: float = 60.0  # A request that is computed for longer is ended [s].
+    megabytes: float = 32.0  # Largest request [MB].
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Name of shipped weights or the path of a weights file."""
+    device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
+
+    def run(self) -> int:
+        """Check, load, and serve until Ctrl-C or SIGTERM."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("apps")
+        from dro_grasp.apps.server.answering import ServerConfig
+        from dro_grasp.apps.server.http_server import Access, listening_socket, serve_grasps
+        from dro_grasp.apps.server.request_queue import RequestQueue
+
+        access = Access(self.host, self.token or os.environ.get(TOKEN), self.megabytes)
+        with listening_socket(self.host, self.port) as listener:
+            config = ServerConfig(self.weights, self.device, self.hand, self.object)
+            queue = RequestQueue(config, self.queue, self.time_limit)
+            host, port = listener.getsockname()[:2]
+            print(f"grasp server: http://{f'[{host}]' if ':' in host else host}:{port}, requests at /docs (Ctrl-C stops it)",
+                  file=sys.stderr, flush=True)
+            serve_grasps(queue, access, listener)
+        return 0
+
+
 def is_motion(file: Path) -> bool:
     """Whether a file holds a plan or attempts of an arm, and not grasps."""
     if file.suffix.lower() == ".npz":
@@ -209,12 +241,7 @@ def is_motion(file: Path) -> bool:
 
 
 def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
-    """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first.
-
-    Raises:
-        DroGraspError: The object cannot be loaded.
-        OptionError: The grasps name no such object, and they have several.
-    """
+    """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first."""
     from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import object_of
 

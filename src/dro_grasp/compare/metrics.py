@@ -58,11 +58,8 @@ def mean_of_rates(rates: Sequence[float], asked: Sequence[int]) -> tuple[float, 
 def mean_share(shares: Float[Tensor, " n"], asked: int | None = None) -> tuple[float, float, float]:
     """Mean of a share that each grasp has, and its 95 % interval; NaN and [0, 1] without grasps.
 
-    The interval is Wilson's for as many successes: shares vary less than successes of the same mean, so it is cautious.
-
-    Args:
-        shares: Of the grasps that there are.
-        asked: How many were asked for; the share of the others is 0.
+    The interval is Wilson's for as many successes: shares vary less than successes of the same mean, so it is cautious. Of
+    grasps that were asked for and are not there, the share is 0.
     """
     return success_rate(float(shares.double().sum()), len(shares) if asked is None else asked)
 

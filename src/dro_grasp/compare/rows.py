@@ -28,14 +28,10 @@ class EvaluatedGrasps:
     """Grasps of one hand on one object, after all trials."""
 
     grasps: GraspBatch
-    results: tuple[TrialResult, ...]
-    """One for each protocol."""
-    seconds: dict[str, float]
-    """Time to make one grasp, by part [s]; of grasps that a source returns, with all their candidates."""
-    fingers: int
-    """Fingers of the hand."""
-    candidates: int
-    """Grasps that were made, of which these are the best by score."""
+    results: tuple[TrialResult, ...]  # One for each protocol
+    seconds: dict[str, float]  # Time to make one grasp, by part [s]; of grasps that a source returns, with all their candidates
+    fingers: int  # Fingers of the hand
+    candidates: int  # Grasps that were made, of which these are the best by score
 
     def best(self, num: int) -> EvaluatedGrasps:
         """The answer to a request for the best `num` by score; the outcome of a trial depends on nothing but the grasp."""
@@ -48,39 +44,27 @@ class EvaluatedGrasps:
 class Row:
     """One line of the table."""
 
-    grasps: str
-    """Their source."""
+    grasps: str  # Their source
     stage: str
     hand: str
-    asked: int
-    """Grasps asked for: n, which all rates are of."""
-    returned: int
-    """Grasps that the method returned, all of which were evaluated."""
-    held: dict[str, int]
-    """Per protocol how many of them succeeded."""
+    asked: int  # Grasps asked for: n, which all rates are of
+    returned: int  # Grasps that the method returned, all of which were evaluated
+    held: dict[str, int]  # Per protocol how many of them succeeded
     success: dict[str, tuple[float, float, float]]
     """Per protocol the share of successes and its 95 % interval (Wilson); the mean over hands in the row of all."""
-    displacement: float
-    """Mean displacement of the object over successes of the first protocol [m]."""
-    rotation: float
-    """Mean rotation of the object, likewise [rad]."""
-    diversity: float
-    """The paper's measure over successes of the first protocol, mixing m and rad as the paper does."""
+    displacement: float  # Mean displacement of the object over successes of the first protocol [m]
+    rotation: float  # Mean rotation of the object, likewise [rad]
+    diversity: float  # The paper's measure over successes of the first protocol, mixing m and rad as the paper does
     trials_held: dict[str, tuple[float, float, float]]
     """Mean share of its trials that a grasp holds in, likewise, per protocol with several trials of each grasp."""
     fingers: dict[str, tuple[float, float]]
     """Per protocol the mean share of the hand's fingers that touch the object after closing, and the share of grasps with
     all of them."""
-    ranking: dict[str, float]
-    """Per protocol the area under the ROC curve of score against success, within each pair."""
-    seconds: dict[str, float]
-    """Time of one grasp, by part [s]; where a source returns its best, with all their candidates."""
-    candidates: float
-    """Grasps made for each pair, of which these are the best by score."""
-    optimised: float
-    """Share of the grasps that the optimiser made."""
-    contact_quality: dict[str, float]
-    """Means of the analytic metrics of DexGraspBench, if they were measured."""
+    ranking: dict[str, float]  # Per protocol the area under the ROC curve of score against success, within each pair
+    seconds: dict[str, float]  # Time of one grasp, by part [s]; where a source returns its best, with all their candidates
+    candidates: float  # Grasps made for each pair, of which these are the best by score
+    optimised: float  # Share of the grasps that the optimiser made
+    contact_quality: dict[str, float]  # Means of the analytic metrics of DexGraspBench, if they were measured
 
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values; `num` is n."""
@@ -88,14 +72,7 @@ class Row:
 
 
 def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
-    """One hand's line.
-
-    Args:
-        source: Where the grasps come from.
-        stage: What was done to them.
-        parts: The hand's grasps, one entry for each view of each object; each states how many were asked for.
-        protocols: Of the results, in their order.
-    """
+    """One hand's line, of its grasps for each view of each object, which state how many were asked for."""
     success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
     asked, numbers = sum(t.grasps.out_of for t in parts), {}
     held_in, fingers = {}, {}

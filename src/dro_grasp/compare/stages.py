@@ -1,4 +1,4 @@
-"""Success rates of methods, before and after refinement and ranking.
+"""Success rates of methods, before and after refinement and ranking, and with equal time.
 
 Source: paper section IV; the stages, the methods and the trials beside the paper's are ours.
 """
@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dro_grasp.compare.equal_time import equal_time, finished_maker
+import torch
+
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.rows import EvaluatedGrasps, Row, average, hand_row
+from dro_grasp.devices import one_thread
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -43,6 +45,8 @@ RETURNED = "returned"
 the optimiser."""
 EQUAL_TIME = "equal-time"  # Stage: the best that each method returns with the CPU time of the first method's best quarter
 KEPT = 0.25  # Share of the grasps of a pair that ranking keeps, before any trial
+Maker = Callable[[int, int], GraspBatch]  # Makes a number of grasps with scores from a seed
+SMALLEST_ROUND = 0.1  # A method goes on if this share of the candidates that it has made still fits into the time (ours)
 
 
 @dataclass(frozen=True)
@@ -51,36 +55,23 @@ class BenchmarkConfig(Checked):
 
     num: int = 100
     """Grasps of each hand on each object, before ranking; RETURNED and EQUAL_TIME return as many as ranking keeps of them."""
-    stages: tuple[str, ...] = STAGES
-    """Which of STAGES, RETURNED and EQUAL_TIME."""
-    protocols: tuple[Protocol, ...] = ()
-    """Trials of every grasp."""
-    view: View = "whole"
-    """What methods, refinement and ranking see of the object; trials are on all of it."""
-    views: int = 1
-    """Views of each object for each hand, with other random numbers and `num` grasps each."""
-    seed: int = 0
-    """Of all grasps and views; each pair's seeds are derived from it."""
-    workers: int | None = None
-    """Threads of the trials; all cores by default."""
-    device: str = "cpu"
-    """Where the grasp energy is computed."""
-    contact_quality: bool = False
-    """Whether contacts are measured too, as DexGraspBench does."""
+    stages: tuple[str, ...] = STAGES  # Which of STAGES, RETURNED and EQUAL_TIME
+    protocols: tuple[Protocol, ...] = ()  # Trials of every grasp
+    view: View = "whole"  # What methods, refinement and ranking see of the object; trials are on all of it
+    views: int = 1  # Views of each object for each hand, with other random numbers and `num` grasps each
+    seed: int = 0  # Of all grasps and views; each pair's seeds are derived from it
+    workers: int | None = None  # Threads of the trials; all cores by default
+    device: str = "cpu"  # Where the grasp energy is computed
+    contact_quality: bool = False  # Whether contacts are measured too, as DexGraspBench does
 
 
 def benchmark(
     hands: Sequence[Hand], objects: Sequence[ObjectModel], methods: Sequence[Method], config: BenchmarkConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Measure the success rates.
+    """Measure the success rates on objects with meshes; a method has no rows of hands that it does not know.
 
-    Args:
-        hands: Which hands; a method has no rows of those that it does not know.
-        objects: Which objects, all with meshes.
-        methods: What makes the grasps.
-        config: Numbers, stages and protocols.
-        progress: Called with (pairs done, pairs in all).
+    `progress` is called with (pairs done, pairs in all).
 
     Raises:
         OptionError: Two methods have one name, or a method returns more grasps than it was asked for.
@@ -199,3 +190,65 @@ def _evaluated(
         grasps = with_contacts(hand, obj, grasps)
     results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
     return EvaluatedGrasps(grasps, results, seconds, len(hand.fingers), candidates)
+
+
+@dataclass(frozen=True)
+class Returned:
+    """What a method returns."""
+
+    grasps: GraspBatch  # The best by score, best first
+    candidates: int  # Grasps made, of which these are the best
+    seconds: float  # CPU time of all of them [s]
+
+
+def equal_time(
+    makers: Mapping[str, Maker], num: int, keep: int, seed: int, clock: Callable[[], float] = time.process_time
+) -> dict[str, Returned]:
+    """The best `keep` candidates of each method, all in the time that the first one takes for `num`.
+
+    Time is the CPU time of this process, with one thread of PyTorch: other programs make it wait, but hardly work longer. What
+    is prepared once for a pair (distance field, contacts, collision scene) is not counted. Ours.
+    """
+    (first, make), *others = makers.items()
+    with one_thread():
+        make(keep, seed)
+        begin = clock()
+        grasps = make(num, seed)
+        found = {first: Returned(_best(grasps, keep), num, clock() - begin)}
+        for name, make in others:
+            found[name] = best_within(found[first].seconds, make, keep, seed, clock)
+    return found
+
+
+def best_within(budget: float, make: Maker, keep: int, seed: int, clock: Callable[[], float]) -> Returned:
+    """The best of as many candidates as fit into a time [s], by what one was measured to cost; of `keep` at least."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def timed(num: int) -> tuple[GraspBatch, float]:
+        begin = clock()
+        grasps = make(num, int(torch.randint(2**31, (), generator=generator)))
+        return grasps, clock() - begin
+
+    _, cost = timed(keep)  # a rough measure, which also prepares what is shared; its time is not counted
+    num, made, spent, pool = max(keep, int(budget * keep / cost)), 0, 0.0, []
+    while num > SMALLEST_ROUND * made:
+        grasps, seconds = timed(num)
+        pool.append(grasps)
+        made, spent = made + num, spent + seconds
+        num = int((budget - spent) * made / spent)
+    return Returned(_best(GraspBatch.concatenate(pool), keep), made, spent)
+
+
+def finished_maker(problem: GraspProblem, method: Method, keep: int) -> Maker:
+    """Candidates of a method, finished; of those that settle, `keep` at least."""
+    config = method.predictor.config.finish
+
+    def make(num: int, seed: int) -> GraspBatch:
+        pool = finish(problem, method.propose(problem, num, seed), config, keep).pool
+        return ease(problem, pool, config.ease, config.admission)
+
+    return make
+
+
+def _best(grasps: GraspBatch, keep: int) -> GraspBatch:
+    return grasps[grasps.score.topk(min(keep, len(grasps))).indices]

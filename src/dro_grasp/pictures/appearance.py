@@ -49,12 +49,9 @@ def link_shapes(hand: Hand) -> list[tuple[int, Float[np.ndarray, "_ 3"], Int[np.
 def hand_meshes(
     hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"] | None = None, *, above_palm: bool = True
 ) -> list[Mesh]:
-    """The posed hand in the object's frame; without a description, its surface points.
+    """The posed hand in the object's frame, by default in that of its wrist; without a description, its surface points.
 
-    Args:
-        joints: Independent joints [rad or m].
-        T_object_wrist: Wrist pose; by default the hand is drawn in its wrist frame.
-        above_palm: Whether to draw links above the palm (a forearm, a stand).
+    With `above_palm`, links above the palm (a forearm, a stand) are drawn too.
     """
     T = torch.eye(4) if T_object_wrist is None else T_object_wrist
     shapes = link_shapes(hand)
@@ -106,9 +103,7 @@ def best_camera(
 def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]) -> float:
     """Number of cells of a coarse picture that show the object or the fingers; the scarcer of the two counts more.
 
-    Args:
-        owner: 1 for points of fingers, 2 for points of the object, 0 for all others.
-        direction: From the points towards the camera.
+    `owner` is 1 for points of fingers, 2 for points of the object, 0 for all others; the direction is that to the camera.
     """
     right, up, backward = Camera(direction, (0.0, 0.0, 0.0)).axes()
     size = float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9

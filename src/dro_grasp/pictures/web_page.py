@@ -24,11 +24,7 @@ td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
 
 
 def write_page(path: Path, title: str, body: str) -> None:
-    """Write a page of an HTML body, whose window has the title.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a page of an HTML body, whose window has the title."""
     with replacing(path) as temporary:
         temporary.write_text(f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"
                              f"{body}<p class=note>dro-grasp {__version__}</p>")

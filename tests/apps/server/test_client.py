@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
 import numpy as np
@@ -15,29 +18,49 @@ from dro_grasp.errors import OptionError
 
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
-from dro_grasp.apps.server import client as module
 from dro_grasp.apps.server.messages import GraspCall
 
 CLOUD = np.random.default_rng(0).uniform(-0.03, 0.03, (40, 3)).astype(np.float32)
 POSE = ((0, -1, 0, 0.5), (1, 0, 0, 0.25), (0, 0, 1, 0.75), (0, 0, 0, 1))
 
 
+class Listener(BaseHTTPRequestHandler):
+    """Notes requests as the server reads them, and answers with nothing."""
+
+    def do_POST(self) -> None:
+        content = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.calls.append(GraspCall(**json.loads(content)))  # type: ignore[attr-defined]
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"{}")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
 @pytest.fixture
-def sent(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def server() -> Iterator[HTTPServer]:
+    with HTTPServer(("127.0.0.1", 0), Listener) as server:
+        server.calls = []  # type: ignore[attr-defined]
+        threading.Thread(target=server.serve_forever, args=[0.01], daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+@pytest.fixture
+def sent(server: HTTPServer) -> list[Any]:
     """Requests as the server reads them."""
-    calls: list[Any] = []
+    return server.calls  # type: ignore[attr-defined]
 
-    def answered(request: Any, timeout: float) -> io.BytesIO:
-        calls.append(GraspCall(**json.loads(request.data)))
-        return io.BytesIO(b"{}")
 
-    monkeypatch.setattr(module, "urlopen", answered)
-    return calls
+@pytest.fixture
+def client(server: HTTPServer) -> dro.GraspClient:
+    return dro.GraspClient(f"http://127.0.0.1:{server.server_port}")
 
 
 @pytest.mark.parametrize("array", [np.array, torch.tensor])
-def test_numbers_may_be_arrays_and_tensors(sent: list[Any], array: Any) -> None:
-    dro.GraspClient().predict(
+def test_numbers_may_be_arrays_and_tensors(client: dro.GraspClient, sent: list[Any], array: Any) -> None:
+    client.predict(
         "gripper3", array(CLOUD), 2, direction=array([0, 0, -1]), contact_region=array([[0, 0, 0.5, 0.25]]),
         table=array(-0.5), keep_table=np.bool_(True), camera={"frame": "base", "T_frame_camera": array(POSE)},
         obstacles=array(CLOUD) + 1, keep_out=[array([0, 1, 0, 0.25])])
@@ -49,10 +72,10 @@ def test_numbers_may_be_arrays_and_tensors(sent: list[Any], array: Any) -> None:
         np.testing.assert_array_equal(np.load(io.BytesIO(part.file.content)), points)
 
 
-def test_none_is_as_if_it_were_left_out(sent: list[Any]) -> None:
+def test_none_is_as_if_it_were_left_out(client: dro.GraspClient, sent: list[Any]) -> None:
     nothing = dict.fromkeys(("obstacles", "camera", "direction", "table", "max_tilt", "protocol"))
     for options in (nothing, {}):
-        dro.GraspClient().predict("gripper3", "can", id="one", **options)
+        client.predict("gripper3", "can", id="one", **options)
     assert sent[0] == sent[1]
 
 
@@ -62,7 +85,9 @@ def test_none_is_as_if_it_were_left_out(sent: list[Any]) -> None:
     ([[0.0, 0.0], [0.0]], {}, "a list that holds no array of numbers"),
     ("can", {"contact_region": {0.1}}, "a set cannot be sent"),
 ])
-def test_what_cannot_be_sent_is_named(sent: list[Any], obj: Any, options: dict[str, Any], told: str) -> None:
+def test_what_cannot_be_sent_is_named(
+    client: dro.GraspClient, sent: list[Any], obj: Any, options: dict[str, Any], told: str
+) -> None:
     with pytest.raises(OptionError, match=told):
-        dro.GraspClient().predict("gripper3", obj, **options)
+        client.predict("gripper3", obj, **options)
     assert not sent

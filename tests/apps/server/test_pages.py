@@ -23,7 +23,6 @@ from dro_grasp.predict.constraints import Constraints
 pytest.importorskip("fastapi", reason="needs the extra [apps]: pip install '.[apps]'")
 pytest.importorskip("uvicorn", reason="needs the extra [apps]: pip install '.[apps]'")
 
-from dro_grasp.apps.server import http_server
 from dro_grasp.apps.server.http_server import Access, application, listening_socket
 from dro_grasp.apps.server.messages import GraspCall, field_docs, settings_in
 from dro_grasp.apps.server.request_queue import Metrics, Ready, Reply, RequestQueue
@@ -153,9 +152,8 @@ def test_large_bodies_are_refused_whether_they_tell_their_size_or_not() -> None:
     assert here("POST", "/grasps", PLAIN).status == 200
 
 
-def test_slow_bodies_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_server, "BODY_TIMEOUT", 0.05)
-    assert Caller(application(Echo(), Access()), delay=0.2)("POST", "/grasps", PLAIN).status == 408
+def test_slow_bodies_are_refused() -> None:
+    assert Caller(application(Echo(), Access(body_seconds=0.05)), delay=0.2)("POST", "/grasps", PLAIN).status == 408
 
 
 def test_a_full_queue_asks_to_come_again_and_a_request_can_be_cancelled() -> None:

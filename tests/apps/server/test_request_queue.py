@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from dro_grasp.apps.server import request_queue as module
 from dro_grasp.apps.server.request_queue import Request, RequestQueue
 from dro_grasp.errors import OptionError, ServerError
 from tests.helpers.quick_answers import QuickAnswerer
@@ -142,13 +141,13 @@ def test_the_request_after_a_fatal_one_is_computed(queue: RequestQueue, what: st
     assert queue.submit(call("next")).reply.result(10) == (200, b"next")
 
 
-def test_a_request_that_does_not_heed_its_cancellation_is_ended(queue: RequestQueue, monkeypatch: pytest.MonkeyPatch) -> None:
-    wait_for_idle(queue)
-    monkeypatch.setattr(module, "GRACE", 0.2)
+def test_a_request_that_does_not_heed_its_cancellation_is_ended() -> None:
+    queue = RequestQueue(None, time_limit=10.0, answerer=QuickAnswerer, grace=0.2)
     deaf = submitted(queue, "deaf", "hang")
     queue.cancel("deaf")
-    assert deaf.reply.result(0.9).status == 409
+    assert deaf.reply.result(5).status == 409
     assert queue.submit(call("next")).reply.result(10) == (200, b"next")
+    queue.close()
 
 
 def test_a_desk_refuses_a_stock_that_cannot_be_loaded_and_limits_without_sense() -> None:

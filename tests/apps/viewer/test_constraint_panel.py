@@ -13,29 +13,19 @@ from dro_grasp.apps.viewer.constraint_panel import NOTHING
 from dro_grasp.apps.viewer.studio import Studio
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.problem import GraspProblem
-from tests.helpers.served_studio import served_studio
+from tests.helpers.served_studio import Listener, asked, served_studio
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory: pytest.TempPathFactory):
-    with served_studio(tmp_path_factory.mktemp("weights")) as made:
+    with served_studio(tmp_path_factory.mktemp("weights"), Listener) as made:
         yield made
 
 
-def asked(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> Constraints:
-    """What a click on Generate asks of the predictor."""
-    problems: list[GraspProblem] = []
-    monkeypatch.setattr(studio.predictor, "run", lambda problem, *_: problems.append(problem) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        studio._generate()
-    return problems[0].constraints
-
-
-def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert asked(studio, monkeypatch) == Constraints(), "empty fields ask for nothing"
+def test_fields_become_constraints_and_are_drawn(studio: Studio) -> None:
+    assert asked(studio)[0].constraints == Constraints(), "empty fields ask for nothing"
     panel, low = studio.panel, float(load_object("sphere").cloud[:, 2].min())
     studio._table_under()
     panel.direction.value, panel.max_tilt.value, panel.pregrasp_clearance.value = "-z", "30", "8"
@@ -44,25 +34,22 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
     trimesh.creation.box(extents=(0.2, 0.2, 0.02), transform=trimesh.transformations.translation_matrix([0.2, 0, 0])).export(
         file, file_type="stl")
     upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
-    studio._take(upload, "scene", studio.panel.obstacles, studio._draw_constraints)
-    drawn: list[str] = []
-    scene = studio.client.scene
-    for kind in ("add_box", "add_icosphere", "add_mesh_simple"):
-        monkeypatch.setattr(scene, kind, lambda name, *_, **__: drawn.append(name))
+    studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
     studio._draw_constraints()
-    names = ("table", "contact_region0", "contact_region1", "keep_out0", "obstacles")
-    assert drawn == [f"/constraints/{name}" for name in names]
-    found = asked(studio, monkeypatch)
+    drawn = [name for name in ("table", "hold0", "hold1", "hold2", "spare0", "spare1", "avoid")
+             if studio.client.scene.get_handle_by_name(f"/constraints/{name}") is not None]
+    assert drawn == ["table", "hold0", "hold1", "spare0", "avoid"]
+    found = asked(studio)[0].constraints
     assert found.direction == (0.0, 0.0, -1.0)
     assert found.max_tilt == pytest.approx(math.radians(30))
     assert found.table == pytest.approx(low, abs=1e-4)
     assert found.contact_region == ((0.0, 0.0, 0.02, 0.05), (0.02, 0.0, 0.0, 0.03))
     assert found.keep_out == ((0.0, 0.0, -0.06, 0.02),)
-    assert found.pregrasp_clearance == pytest.approx(0.008)
-    assert found.obstacles is not None
-    assert found.obstacles.name == "shelf"
-    panel.obstacles.value = NOTHING
-    assert asked(studio, monkeypatch).avoid is None
+    assert found.opening == pytest.approx(0.008)
+    assert found.avoid is not None
+    assert found.avoid.name == "shelf"
+    panel.avoid.value = NOTHING
+    assert asked(studio)[0].constraints.avoid is None
 
 
 @pytest.mark.parametrize(("field", "text", "message"), [

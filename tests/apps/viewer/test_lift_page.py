@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.apps.viewer import lift_page as pages
 from dro_grasp.apps.viewer.lift_page import EVERY, Film, LiftPage, lift_page
 from dro_grasp.arm.animation import Recorder
-from dro_grasp.arm.attempts import Attempt, TabletopConfig
 from dro_grasp.arm.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.robot_check import robot_shapes, shape_poses
-from dro_grasp.arm.tabletop import write_attempts
+from dro_grasp.arm.tabletop import Attempt, TabletopConfig, write_attempts
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
@@ -63,7 +61,7 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
 
 
 def test_each_attempt_is_played_with_its_own_robot_and_weights(
-    robot: dro.Robot, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robot: dro.Robot, small_robot: str, tmp_path: Path
 ) -> None:
     other, ran, label = dro.load_robot(small_robot), [], TabletopConfig().label()
     shipped, own = describe_weights()["sha256"], str(untrained_weights(tmp_path))
@@ -71,19 +69,19 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
               Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights=DEFAULT,
                       robot_sha256=other.sha256, weights_sha256=shipped, object_sha256="that of another can")]
 
-    def ended(used: dro.Robot, obj: object, number: int, seed: int, weights: str, _: object, recorder: Recorder) -> Attempt:
-        ran.append((used.name, number, weights))
+    def ended(
+        used: dro.Robot, obj: object, number: int, seed: int, predictor: dro.GraspPredictor, _: object, recorder: Recorder
+    ) -> Attempt:
+        ran.append((used.name, number, predictor.weights_name))
         recorder.frames.append((used.home, used.hand.canonical_joints().double().numpy(), np.zeros((0, 4, 4))))
         return stored[number]
 
-    monkeypatch.setattr(pages, "attempt", ended)
-    monkeypatch.setattr(pages, "GraspPredictor", lambda weights: weights)
     write_attempts(stored, tmp_path / "results.parquet")
-    page = lift_page(tmp_path / "results.parquet", port=free_port())
+    page = lift_page(tmp_path / "results.parquet", port=free_port(), make=ended)
     try:
         assert "Not as stored" not in page.text.content
         page.repeat(1)
-        assert ran == [(robot.name, 0, own), (other.name, 1, DEFAULT)]
+        assert ran == [(robot.name, 0, dro.load_weights(own).name), (other.name, 1, DEFAULT)]
         assert page.name.content == f"**{other.name}**"
         assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
         expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
@@ -91,7 +89,7 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
         assert "Not as stored**: with other content than then: object. held" in page.text.content
     finally:
         page.stop()
-    lift_page(tmp_path / "results.parquet", 0, small_robot, DEFAULT, port=free_port()).stop()
+    lift_page(tmp_path / "results.parquet", 0, small_robot, DEFAULT, port=free_port(), make=ended).stop()
     assert ran[2:] == [(other.name, 0, DEFAULT)], "what is given instead is used"
 
 

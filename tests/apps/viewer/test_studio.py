@@ -17,7 +17,7 @@ import viser
 import yaml
 
 from dro_grasp.apps.viewer import grasp_page as module
-from dro_grasp.apps.viewer.grasp_page import EXPORTS, GraspViewer, chosen, postures_of
+from dro_grasp.apps.viewer.grasp_page import EXPORTS, GraspViewer, chosen, exported, postures_of
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.cli.view import View
@@ -28,6 +28,7 @@ from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.predictor import GraspPredictor
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.served_studio import served_studio, visited
 from tests.helpers.weights import untrained_weights
@@ -111,7 +112,6 @@ def test_contacts_are_marked_where_the_hand_touches_and_only_when_asked(studio: 
 def test_a_trial_plays_and_ends_where_it_began(
     studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(time, "sleep", lambda _: None)
     seen = []
     honest = studio.view.show
 
@@ -160,8 +160,8 @@ def test_a_filter_that_no_grasp_passes_ends_a_trial_that_plays(
 
 
 @pytest.mark.parametrize("kind", EXPORTS)
-def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownGrasps, kind: str) -> None:
-    name, content = studio.exported(kind)
+def test_what_is_taken_away_is_what_is_shown(made: module.ShownGrasps, kind: str) -> None:
+    name, content = exported(made.hand, made.obj, made.refined, kind)
     assert name.startswith("gripper3_sphere")
     if name.endswith(".parquet"):
         assert torch.equal(GraspBatch.load(io.BytesIO(content)).joints, made.refined.joints)
@@ -174,16 +174,13 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
 
 @pytest.mark.parametrize("kind", [title for title in EXPORTS if title != module.GRASP_FILE])
 def test_grasps_that_state_no_pregrasp_are_taken_away_with_the_one_that_is_shown(
-    studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch, kind: str
+    made: module.ShownGrasps, kind: str
 ) -> None:
     unknown = torch.full_like(made.refined.joints, float("nan"))
     bare = made.refined.replace(pregrasp_joints=unknown, squeeze_joints=unknown)
-    monkeypatch.setattr(studio, "made", replace(made, refined=bare))
-    name, content = studio.exported(kind)
     shown = postures_of(made.hand, made.obj, bare)
     stated = made.refined.replace(pregrasp_joints=shown["pregrasp"], squeeze_joints=shown["squeeze"])
-    monkeypatch.setattr(studio, "made", replace(made, refined=stated))
-    assert (name, content) == studio.exported(kind)
+    assert exported(made.hand, made.obj, bare, kind) == exported(made.hand, made.obj, stated, kind)
 
 
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
@@ -199,12 +196,12 @@ def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     studio.hand.value = "gripper3"
 
 
-def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
 
-    def upload(name: str) -> threading.Thread:
+    def upload(name: str, patience: float = 10.0) -> threading.Thread:
         file = viser.UploadedFile(name=name, content=text)
-        thread = threading.Thread(target=lambda: studio._take(file, "hand", studio.hand, studio._preview))
+        thread = threading.Thread(target=lambda: studio._take(file, "hand", studio.hand, studio._preview, patience))
         thread.start()
         return thread
 
@@ -217,9 +214,8 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkey
     assert studio.hand.value == "early.urdf"
     assert "early.urdf is picked" in studio.status.content
     studio.hand.value = "gripper3"
-    monkeypatch.setattr("dro_grasp.apps.viewer.studio.UPLOAD_TIMEOUT", 0.1)
     with studio._busy:
-        upload("late.urdf").join(20)
+        upload("late.urdf", 0.1).join(20)
     assert studio.hand.value == "gripper3"
     assert "late.urdf" in studio.hand.options
     assert "late.urdf is stored; pick it" in studio.status.content
@@ -274,13 +270,25 @@ def test_one_thing_at_a_time(studio: Studio) -> None:
 
 
 def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
-    studio: Studio, monkeypatch: pytest.MonkeyPatch
+    studio: Studio
 ) -> None:
     """Two browsers come, one leaves while it works, the other stays as it was."""
     made: list[Studio] = []
+    begun, steps = threading.Event(), []
+
+    class Endless(GraspPredictor):
+        def __init__(self) -> None:
+            self.device, self.network = "cpu", studio.predictor.network
+
+        def run(self, problem, request, progress=None):
+            begun.set()
+            for step in range(1000):
+                steps.append(step)
+                progress(step, 1000)
+                time.sleep(0.01)
 
     def make(client, turn):
-        made.append(Studio(client, studio.predictor, "gripper3", "sphere", turn))
+        made.append(Studio(client, Endless(), "gripper3", "sphere", turn))
         return made[-1]
 
     served = StudioServer(make, free_port())
@@ -292,16 +300,6 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
         folders = [Path(page.library.folder.name) for page in made]
-        begun, steps = threading.Event(), []
-
-        def endless(*arguments, **_):
-            begun.set()
-            for step in range(1000):
-                steps.append(step)
-                arguments[2](step, 1000)
-                time.sleep(0.01)
-
-        monkeypatch.setattr(studio.predictor, "run", endless)
         work = threading.Thread(target=lambda: made[0]._guarded(made[0]._generate))
         work.start()
         assert begun.wait(20)

@@ -17,9 +17,8 @@ from cachetools import LRUCache
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.apps.library import Kind, Library
+from dro_grasp.apps.library import Kind, Library, store_upload
 from dro_grasp.apps.server.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
-from dro_grasp.apps.uploads import store_upload
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
 from dro_grasp.frames import is_name, motion_fault
@@ -49,10 +48,8 @@ MAX_CANDIDATES = 1_000  # Most candidates of one request (ours): a server answer
 class ServerConfig(Checked):
     """What a server computes with."""
 
-    weights: str | None = None
-    """Name of shipped weights or path of a weights file; None takes the default."""
-    device: str = "cpu"
-    """Where the network and the energies run."""
+    weights: str | None = None  # Name of shipped weights or path of a weights file; None takes the default
+    device: str = "cpu"  # Where the network and the energies run
     hands: tuple[str, ...] = ()
     """Names or files of hands that are loaded before serving; built-in ones can be asked for besides."""
     objects: tuple[str, ...] = ()
@@ -75,15 +72,7 @@ class Answerer:
         self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
     def _offer(self, kind: Kind, named: Sequence[tuple[str, str, Any]]) -> None:
-        """Let what lies in files be asked for by name.
-
-        Args:
-            kind: What all are.
-            named: Name, name or file that was given, and what the library takes, of each.
-
-        Raises:
-            OptionError: Two have one name.
-        """
+        """Let what lies in files be asked for: of each its name, the name or file given, and what the library takes."""
         first: dict[str, str] = {}
         for name, source, content in named:
             other = first.setdefault(name, source)
@@ -93,11 +82,7 @@ class Answerer:
             self.library.add(kind, name, content)
 
     def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
-        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work.
-
-        Raises:
-            DroGraspError: The request cannot be met.
-        """
+        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work."""
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
         constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))

@@ -81,11 +81,7 @@ class GraspClient:
 
 
 def listed(value: Any) -> Any:
-    """An array or tensor as lists of numbers, as JSON has them; lists stay.
-
-    Raises:
-        OptionError: The value is neither.
-    """
+    """An array or tensor as lists of numbers, as JSON has them; lists stay."""
     if isinstance(value, list | tuple):
         return value
     if not hasattr(value, "tolist"):
@@ -95,11 +91,7 @@ def listed(value: Any) -> Any:
 
 
 def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
-    """An object as a request holds it: its file's bytes, its points as a file, or its name.
-
-    Raises:
-        OptionError: It is none of these.
-    """
+    """An object as a request holds it: its file's bytes, its points as a file, or its name."""
     if isinstance(obj, str | Path):
         path = given_path(obj)
         return sent_file(path.name, path.read_bytes()) if path.is_file() else {"name": str(obj)}

@@ -25,7 +25,6 @@ from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
 from dro_grasp.errors import OptionError, ServerError
 
-BODY_TIMEOUT = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 SHUTDOWN_TIMEOUT = 10.0  # Time that requests under way get to end when the server is stopped [s] (ours)
 MAX_CONNECTIONS = 128  # Most open connections (ours)
 
@@ -34,12 +33,10 @@ MAX_CONNECTIONS = 128  # Most open connections (ours)
 class Access:
     """Who may ask, and how much at once."""
 
-    host: str = "127.0.0.1"
-    """Address to serve at; only this machine can connect by default."""
-    token: str | None = None
-    """What requests must bear; needed where others can connect."""
-    megabytes: float = 32.0
-    """Largest body of a request [MB]."""
+    host: str = "127.0.0.1"  # Address to serve at; only this machine can connect by default
+    token: str | None = None  # What requests must bear; needed where others can connect
+    megabytes: float = 32.0  # Largest body of a request [MB]
+    body_seconds: float = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 
     def __post_init__(self) -> None:
         if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
@@ -83,7 +80,8 @@ class Gate:
 
     def _limited(self, receive: Any) -> Any:
         """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits."""
-        size, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_TIMEOUT
+        size, whole, seconds = 0, False, self.access.body_seconds
+        deadline = asyncio.get_running_loop().time() + seconds
 
         async def part() -> Any:
             nonlocal size, whole
@@ -93,7 +91,7 @@ class Gate:
                 async with asyncio.timeout_at(deadline):
                     message = await receive()
             except TimeoutError:
-                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {BODY_TIMEOUT:g} s") from None
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {seconds:g} s") from None
             size += len(message.get("body", b""))
             whole = not message.get("more_body", False)
             if size > 1e6 * self.access.megabytes:
@@ -208,11 +206,7 @@ def metrics_text(queue: RequestQueue) -> str:
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens at an address.
-
-    Raises:
-        OptionError: This machine cannot listen there.
-    """
+    """A socket that listens at an address."""
     if not 0 <= port < 2**16:
         raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

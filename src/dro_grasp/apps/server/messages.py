@@ -151,11 +151,7 @@ GraspCall: Any = create_model(
 
 
 def settings_in(call: Any, settings: type[Settings], **loaded: Any) -> Settings:
-    """The dataclass of a class whose fields a GraspCall holds, and those that were loaded from what it holds.
-
-    Raises:
-        OptionError: A value is out of range.
-    """
+    """The dataclass of a class whose fields a GraspCall holds, and those that were loaded from what it holds."""
     return settings(**{f.name: getattr(call, f.name) for f in fields(settings)} | loaded)  # type: ignore[arg-type]
 
 

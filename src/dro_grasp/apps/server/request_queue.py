@@ -22,9 +22,6 @@ from pebble import ProcessExpired, ProcessPool
 
 from dro_grasp.errors import DroGraspError, OptionError, ServerError
 
-GRACE = 3.0
-"""Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds [s] (ours)."""
-
 
 class Reply(NamedTuple):
     """What a request comes to: a status of HTTP and a JSON object."""
@@ -56,10 +53,8 @@ class Cancelled(Exception):
 class Computer:
     """What the process keeps from one request to the next, and does there."""
 
-    answerer: Any
-    """Answers the requests."""
-    cancelled: Any
-    """Number of the request that was cancelled last, in memory that the server's process writes."""
+    answerer: Any  # Answers the requests
+    cancelled: Any  # Number of the request that was cancelled last, in memory that the server's process writes
 
     @classmethod
     def prepare(cls, cancelled: Any) -> None:
@@ -93,17 +88,12 @@ class Computer:
 class Request:
     """A request on its way."""
 
-    call: Any
-    """A GraspCall."""
-    number: int
-    """Of all requests."""
+    call: Any  # A GraspCall
+    number: int  # Of all requests
     reply: Future[Reply] = field(default_factory=Future)
-    turn: Future[None] | None = None
-    """Its place in the queue."""
-    task: Future[Reply] | None = None
-    """Its computation, once it is its turn."""
-    since: float = field(default_factory=time.monotonic)
-    """When it came [s]."""
+    turn: Future[None] | None = None  # Its place in the queue
+    task: Future[Reply] | None = None  # Its computation, once it is its turn
+    since: float = field(default_factory=time.monotonic)  # When it came [s]
 
     def abandon(self) -> None:
         """End its computation together with the process, as pebble does with a task that is cancelled while it runs."""
@@ -115,19 +105,18 @@ class Request:
 class Metrics:
     """What a queue has done."""
 
-    replies: Counter[int] = field(default_factory=Counter)
-    """By the status of HTTP."""
+    replies: Counter[int] = field(default_factory=Counter)  # By the status of HTTP
     waiting_seconds: float = 0.0
     computing_seconds: float = 0.0
-    starts: int = 0
-    """Of the process."""
+    starts: int = 0  # Of the process
 
 
 class RequestQueue:
     """Takes requests in order, within limits; whatever a request does to the process, the next one is computed."""
 
     def __init__(
-        self, config: Any, longest: int = 16, time_limit: float = 60.0, answerer: Callable[[Any], Any] | None = None
+        self, config: Any, longest: int = 16, time_limit: float = 60.0, answerer: Callable[[Any], Any] | None = None,
+        grace: float = 3.0,
     ) -> None:
         """Start the process, and wait until it has loaded what it computes with.
 
@@ -136,6 +125,8 @@ class RequestQueue:
             longest: Requests that may wait.
             time_limit: A request that is computed for longer is ended [s].
             answerer: Makes what answers, in the process; an `Answerer` by default.
+            grace: Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds
+                [s] (ours).
 
         Raises:
             DroGraspError: A limit is out of range, or something cannot be loaded.
@@ -145,7 +136,7 @@ class RequestQueue:
                               "time")
         if answerer is None:
             from dro_grasp.apps.server.answering import Answerer as answerer
-        self.config, self.longest, self.time_limit, self.answerer = config, longest, time_limit, answerer
+        self.config, self.longest, self.time_limit, self.answerer, self.grace = config, longest, time_limit, answerer, grace
         self.metrics, self.closed = Metrics(), False
         self._known: dict[str, Request] = {}
         self._running: Request | None = None
@@ -202,7 +193,7 @@ class RequestQueue:
                 return False
             if request.turn is None or not request.turn.cancel():
                 self._cancelled.value = request.number
-                patience = threading.Timer(GRACE, request.abandon)
+                patience = threading.Timer(self.grace, request.abandon)
                 patience.daemon = True
                 patience.start()
                 return True

@@ -27,7 +27,6 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.sheets import after_closing, contact_points, outcome, protocol_name, shows_held
 from dro_grasp.simulation.trial import record
 
-FRAME_TIME = 0.04  # Time between two pictures of a trial [s] (ours)
 Posture = Literal["held", "open", "pregrasp", "grasp", "squeeze"]
 """Stages of closing the hand; the first is that after closing in a trial."""
 GRASP_FILE = "grasp file (Parquet)"  # Choice of the grasp file itself among the formats that can be downloaded
@@ -40,16 +39,11 @@ class ShownGrasps:
 
     hand: Hand
     obj: ObjectModel
-    raw: GraspBatch
-    """As the network proposed them, in the order of the refined ones."""
-    refined: GraspBatch
-    """Best score first."""
-    protocol: str
-    """Protocol of the trials."""
-    shortage: str | None = None
-    """Why there are fewer than were asked for."""
-    on_table: bool = False
-    """Whether a table is shown below them."""
+    raw: GraspBatch  # As the network proposed them, in the order of the refined ones
+    refined: GraspBatch  # Best score first
+    protocol: str  # Protocol of the trials
+    shortage: str | None = None  # Why there are fewer than were asked for
+    on_table: bool = False  # Whether a table is shown below them
     predicted: Float[Tensor, "n n_points 3"] | None = None
     """Hand points multilaterated from D(R,O), before the solver [m]; files do not store them."""
 
@@ -64,6 +58,8 @@ class Film(NamedTuple):
 
 class GraspPage(Page):
     """A page with a folder of controls for the grasps that it shows."""
+
+    frame_seconds = 0.04  # Time between two pictures of a trial [s] (ours)
 
     def __init__(self, client: Client) -> None:
         super().__init__(client)
@@ -177,7 +173,7 @@ class GraspPage(Page):
         self.film, self.moment.max, self.moment.disabled = film, last, False
         if self._picked() != index:  # while it was recorded
             self._forget_film()
-        if self._roll(film, last + 1, FRAME_TIME):
+        if self._roll(film, last + 1, self.frame_seconds):
             self._say("Played. Move *Moment* to see any moment again.")
         else:
             self._say("Stopped: something else was picked.")
@@ -195,26 +191,25 @@ class GraspPage(Page):
 
     def _send(self, event: viser.GuiEvent) -> None:
         """Send the shown grasps to the browser."""
-        name, content = self.exported(self.format.value)
+        assert self.made is not None
+        name, content = exported(self.made.hand, self.made.obj, self._batch()[self.shown], self.format.value)
         if event.client is not None:
             event.client.send_file_download(name, content, save_immediately=True)
         self._say(f"{escaped(name)}: {len(self.shown)} grasps.")
 
-    def exported(self, kind: str) -> tuple[str, bytes]:
-        """Name and content of a file with the shown grasps, in one of EXPORTS.
 
-        A grasp file has what they state; for other software, the controller makes the pregrasps and squeezes that they lack.
-        """
-        assert self.made is not None
-        grasps = self._batch()[self.shown]
-        stem = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}"
-        if kind == GRASP_FILE:
-            return f"{stem}.parquet", grasps.to_bytes()
-        centre = torch.as_tensor(self.made.obj.centre_of_mass, dtype=grasps.joints.dtype)
-        grasps = complete(self.made.hand, grasps, centre)
-        name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
-        content = form.content(ExportJob(grasps, Frame(), self.made.hand))
-        return f"{stem}_{name}{form.suffix}", cast(bytes, content)
+def exported(hand: Hand, obj: ObjectModel, grasps: GraspBatch, kind: str) -> tuple[str, bytes]:
+    """Name and content of a file with grasps, in one of EXPORTS.
+
+    A grasp file has what they state; for other software, the controller makes the pregrasps and squeezes that they lack.
+    """
+    stem = f"{Path(hand.name).name}_{Path(obj.name).name}"
+    if kind == GRASP_FILE:
+        return f"{stem}.parquet", grasps.to_bytes()
+    grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=grasps.joints.dtype))
+    name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
+    content = form.content(ExportJob(grasps, Frame(), hand))
+    return f"{stem}_{name}{form.suffix}", cast(bytes, content)
 
 
 def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from jaxtyping import Float
 
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
-from dro_grasp.arm.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.arm.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan
 from dro_grasp.arm.reachability import carried
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
+from dro_grasp.arm.tabletop import Attempt, TabletopConfig, attempt, read_attempts
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.network.checkpoints import describe_weights
@@ -37,15 +37,11 @@ EVERY = "all"  # Choice of every grasp
 class Film:
     """A motion, picture by picture."""
 
-    arm: Float[np.ndarray, "k n_arm"]
-    """[rad or m]"""
-    hand: Float[np.ndarray, "k n_dof"]
-    """[rad or m]"""
-    poses: Float[np.ndarray, "k o 4 4"]
-    """Of the objects in the world [m]; of a plan, those of the cloud that it was made for."""
+    arm: Float[np.ndarray, "k n_arm"]  # [rad or m]
+    hand: Float[np.ndarray, "k n_dof"]  # [rad or m]
+    poses: Float[np.ndarray, "k o 4 4"]  # Of the objects in the world [m]; of a plan, those of the cloud that it was made for
     plan: MotionPlan | None
-    objects: tuple[ObjectModel, ...] = ()
-    """As simulated; none in a plan."""
+    objects: tuple[ObjectModel, ...] = ()  # As simulated; none in a plan
 
     @staticmethod
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:
@@ -61,11 +57,7 @@ class Film:
 
     @staticmethod
     def of_attempt(recorder: Recorder) -> Film:
-        """What was simulated.
-
-        Raises:
-            OptionError: The robot did not move.
-        """
+        """What was simulated."""
         if not recorder.frames:
             raise OptionError("the attempt ended before the robot moved; there is nothing to play")
         arm, hand, poses = (np.stack(part) for part in zip(*recorder.frames, strict=True))
@@ -81,16 +73,17 @@ class LiftPage(ServedPage, Page):
     """
 
     def __init__(
-        self, robot: Robot, attempts: Sequence[Attempt] = (), weights: str | None = None, port: int = 8080, host: str = HOST
+        self, robot: Robot, attempts: Sequence[Attempt] = (), weights: str | None = None, port: int = 8080, host: str = HOST,
+        make: Callable[..., Attempt] = attempt,
     ) -> None:
         """Start serving with the robot at home.
 
         Args:
-            robot: The robot that is shown first.
             attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
             weights: Name or file, where those that they were made with are not meant.
+            make: Runs them.
         """
-        self.robot, self.attempts, self.weights = robot, list(attempts), weights
+        self.robot, self.attempts, self.weights, self.make = robot, list(attempts), weights, make
         ServedPage.__init__(self, port, host)
         Page.__init__(self, self.server)
         self.film: Film | None = None
@@ -146,7 +139,7 @@ class LiftPage(ServedPage, Page):
         robot = self.robot if same else load_robot(stored.robot_file or stored.robot)
         obj = load_object(stored.object_file or stored.object)
         weights = self.weights or stored.weights or None
-        made = attempt(robot, obj, stored.number, stored.seed, GraspPredictor(weights), config, recorder)
+        made = self.make(robot, obj, stored.number, stored.seed, GraspPredictor(weights), config, recorder)
         film, self.film = Film.of_attempt(recorder), None
         if robot is not self.robot:
             self._put(robot)
@@ -229,17 +222,13 @@ class LiftPage(ServedPage, Page):
 
 
 def lift_page(
-    file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST
+    file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST,
+    make: Callable[..., Attempt] = attempt,
 ) -> LiftPage:
     """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
 
     Robot and weights are given, by name or file, where the file's own are not meant.
-
-    Raises:
-        DroGraspError: The file or the robot cannot be used.
     """
-    from dro_grasp.arm.tabletop import read_attempts
-
     if file.suffix.lower() == ".npz":
         plan = MotionPlan.load(file)
         page = LiftPage(load_robot(robot or plan.notes.robot), (), weights, port, host)
@@ -250,6 +239,6 @@ def lift_page(
         raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; --attempt is {chosen}")
     if robot is not None:
         attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
-    page = LiftPage(load_robot(attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host)
+    page = LiftPage(load_robot(attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host, make)
     page.repeat(chosen)
     return page

@@ -191,8 +191,7 @@ class Closed(Exception):
 class Page(ABC):
     """A page with a stage and a film of it, which does one thing at a time and shows errors."""
 
-    status: viser.GuiMarkdownHandle
-    """What the page does, and errors; whoever inherits adds it."""
+    status: viser.GuiMarkdownHandle  # What the page does, and errors; whoever inherits adds it
 
     def __init__(self, client: Client) -> None:
         self.client, self.view, self.film = client, SceneView(client), None
@@ -244,12 +243,8 @@ class Page(ABC):
         self._say(f"**Error:** {escaped(error)}")
 
     def _say(self, text: str) -> None:
-        """Show a line.
-
-        Raises:
-            Closed: Nobody sees it any more; whatever goes on ends here.
-        """
-        if self.closed.is_set():
+        """Show a line."""
+        if self.closed.is_set():  # nobody sees it any more, and whatever goes on ends here
             raise Closed
         self.status.content = text
 

@@ -37,8 +37,6 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 MAX_GRASPS = 64  # Most grasps of one click (ours)
 MAX_CANDIDATES = 8  # Most candidates for each of them (ours)
 TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still open [s] (ours)
-UPLOAD_TIMEOUT = 10.0
-"""Time that an upload waits to be picked while the page does other work, such as loading its first pair [s] (ours)."""
 CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does before its uploads are deleted [s] (ours)
 
 
@@ -170,9 +168,13 @@ class Studio(GraspPage):
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
     def _take(
-        self, upload: viser.UploadedFile, kind: Kind, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]
+        self, upload: viser.UploadedFile, kind: Kind, choice: viser.GuiDropdownHandle[str], show: Callable[[], None],
+        patience: float = 10.0,
     ) -> None:
-        """Store an upload, pick it and show it; where other work takes long, it can be picked later."""
+        """Store an upload, pick it and show it.
+
+        Where other work, such as loading the first pair, outlasts the patience [s] (ours), it can be picked later.
+        """
         with suppress(Closed):
             if self.closed.is_set():
                 return
@@ -185,7 +187,7 @@ class Studio(GraspPage):
                 self._batches.pop(label, None)
             choice.options = tuple(dict.fromkeys([*choice.options, label]))
             later = f"Busy. {escaped(label)} is stored; pick it afterwards."
-            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_TIMEOUT, later)
+            self._guarded(lambda: self._pick_upload(label, choice, show), patience, later)
 
     def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
         choice.value = label
