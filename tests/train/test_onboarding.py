@@ -221,6 +221,14 @@ def test_what_is_refused_leaves_no_folder(
     assert not (home / "new").exists()
 
 
+@pytest.mark.parametrize(("more", "word"), [
+    ({"grasps_drawn": 0}, "grasps_drawn is 0"), ({"most_grasps": 0}, "most_grasps is 0"),
+    ({"data_share": 0.7}, r"are \(0.7, 0.4\)"), ({"training_share": 0.0}, r"are \(0.45, 0.0\)")])
+def test_fields_out_of_range_are_refused(more: dict[str, float], word: str) -> None:
+    with pytest.raises(OptionError, match=word):
+        OnboardingConfig(**more)
+
+
 def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [home / folder / "cup.stl" for folder in ("a", "b")]
     for file in files:

@@ -86,9 +86,11 @@ class OnboardingConfig(Checked):
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
         require_device(self.device)
-        for name, value in (("num", self.num), ("workers", self.workers)):
-            if value < 1:
-                raise OptionError(f"{name} is {value}; give at least 1 (--{name})")
+        for name, option in (("num", " (--num)"), ("workers", " (--workers)"), ("most_grasps", ""), ("grasps_drawn", "")):
+            if (value := getattr(self, name)) < 1:
+                raise OptionError(f"{name} is {value}; give at least 1{option}")
+        if min(shares := (self.data_share, self.training_share)) <= 0 or sum(shares) > 1:
+            raise OptionError(f"data_share and training_share are {shares}; give two positive numbers, at most 1 together")
         source_or_name(self.source)
 
 
@@ -270,8 +272,9 @@ class _Onboarding:
             why = "; ".join(dict.fromkeys(failures.values())) or "too little time (--minutes)"
             raise BundleError(f"no grasp of {self.name} held, so there is nothing to train on; look at "
                               f"{self.folder / PICTURE}, and at why: {why}")
-        return {"counts": counts, "failures": failures, "said": f"{sum(counts.values())} grasps that hold under strict, of "
-                f"{sum(n > 0 for n in counts.values())} of {len(self.objects)} objects"}
+        said = (f"{sum(counts.values())} grasps that hold under {config.engine.protocol}, of "
+                f"{sum(n > 0 for n in counts.values())} of {len(self.objects)} objects")
+        return {"counts": counts, "failures": failures, "said": said}
 
     def _training(self) -> dict[str, Any]:
         path = self.folder / "bundle.safetensors"
