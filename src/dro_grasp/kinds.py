@@ -147,19 +147,11 @@ def renamed(**former: str) -> Callable[[Named], Named]:
         former: The present name by each former one: of a function's argument, or of a class's field, property or method.
     """
     def decorate(owner: Named) -> Named:
-        if not isinstance(owner, type):
-            return _taking_former(owner, former)  # type: ignore[return-value]
-        signature = inspect.signature(owner.__init__)  # type: ignore[misc]
-        given = {old: new for old, new in former.items() if new in signature.parameters}
-        if given:
-            made = _taking_former(owner.__init__, given)  # type: ignore[misc]
-            # What checks calls by their signature, as jaxtyping does, must not refuse the former names.
-            more = inspect.Parameter("former", inspect.Parameter.VAR_KEYWORD, annotation=Any)
-            made.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])  # type: ignore[attr-defined]
-            owner.__init__ = made  # type: ignore[misc]
-        for old, new in former.items():
-            setattr(owner, old, _former_attribute(old, new))
-        return owner  # type: ignore[return-value]
+        changed: Any = owner
+        if isinstance(changed, type):
+            _answer_to_former(changed, former)
+            return owner
+        return _taking_former(changed, former)  # type: ignore[return-value]
 
     return decorate
 
@@ -184,6 +176,19 @@ def _taking_former(call: Callable[..., Any], former: Mapping[str, str]) -> Calla
         return call(*args, **kwargs)
 
     return taking
+
+
+def _answer_to_former(owner: Any, former: Mapping[str, str]) -> None:
+    """Let a class be made and read by former names too."""
+    signature = inspect.signature(owner.__init__)
+    given = {old: new for old, new in former.items() if new in signature.parameters}
+    if given:
+        owner.__init__ = _taking_former(owner.__init__, given)
+        # What checks calls by their signature, as jaxtyping does, must not refuse the former names.
+        more = inspect.Parameter("former", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+        owner.__init__.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])
+    for old, new in former.items():
+        setattr(owner, old, _former_attribute(old, new))
 
 
 def _former_attribute(old: str, new: str) -> property:
