@@ -94,7 +94,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def quick_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that train measure the statistics of BatchNorm over two batches, which takes most of so short a run."""
-    from dro_grasp.train import loop
-    from dro_grasp.train.runs import recalibrate
+    from dro_grasp.training import loop
+    from dro_grasp.training.runs import recalibrate
 
     monkeypatch.setattr(loop, "recalibrate", lambda model, forward, _: recalibrate(model, forward, 2))

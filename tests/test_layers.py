@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-BARE = ("dro_grasp.train.loop", "dro_grasp.train.pretraining", "dro_grasp.train.data.bundle.training_file",
+BARE = ("dro_grasp.training.loop", "dro_grasp.training.pretraining", "dro_grasp.training.data.bundle.training_file",
         "dro_grasp.network.checkpoints", "dro_grasp.hands.hand")
 FORBIDDEN = ("mujoco", "trimesh", "viser", "igl", "coacd", "matplotlib", "PIL", "rich", "tyro")
 

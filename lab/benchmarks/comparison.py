@@ -35,7 +35,7 @@ from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.train.data.bundle.training_file import load_bundle
+from dro_grasp.training.data.bundle.training_file import load_bundle
 from lab.benchmarks.report import emit, rate
 
 RAW = ":raw"

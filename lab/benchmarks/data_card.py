@@ -11,10 +11,10 @@ from collections import Counter
 from pathlib import Path
 
 from dro_grasp.compare.rows import finger_contact
-from dro_grasp.train.data.collections.collection import read_collection
-from dro_grasp.train.data.collections.coverage import measure_coverage
-from dro_grasp.train.data.collections.report import charts, grasps_drawn
-from dro_grasp.train.data.engine.shards import Yield
+from dro_grasp.training.data.collections.collection import read_collection
+from dro_grasp.training.data.collections.coverage import measure_coverage
+from dro_grasp.training.data.collections.report import charts, grasps_drawn
+from dro_grasp.training.data.engine.shards import Yield
 from lab.benchmarks.report import ROOT
 
 PICTURED = "assets-shadowhand.parquet"

@@ -15,10 +15,10 @@ import torch
 
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.simulation.protocols import changed
-from dro_grasp.train.data.collections.checking import check
-from dro_grasp.train.data.collections.collection import PairGrasps, read_collection
-from dro_grasp.train.data.collections.coverage import measure_coverage
-from dro_grasp.train.data.engine.shards import Yield
+from dro_grasp.training.data.collections.checking import check
+from dro_grasp.training.data.collections.collection import PairGrasps, read_collection
+from dro_grasp.training.data.collections.coverage import measure_coverage
+from dro_grasp.training.data.engine.shards import Yield
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS, training_objects
 

@@ -29,9 +29,9 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.train.config import ScheduleConfig, TrainConfig
-from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
-from dro_grasp.train.loop import train
+from dro_grasp.training.config import ScheduleConfig, TrainConfig
+from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
+from dro_grasp.training.loop import train
 from lab.benchmarks.report import emit
 
 HAND, OBJECT = "allegro", "rubber_duck"

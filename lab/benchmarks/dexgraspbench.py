@@ -29,7 +29,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.contacts import NAMES, with_contacts
-from dro_grasp.train.data.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
+from dro_grasp.training.data.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
 from lab.benchmarks.report import emit, rate
 
 PALM = 0.034

@@ -29,7 +29,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, processed_objects
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.train.data.collections.importing import read_npy
+from dro_grasp.training.data.collections.importing import read_npy
 from lab.benchmarks.dexgraspbench import OFFICIAL, OURS, PALM
 from lab.benchmarks.report import emit, rate
 

@@ -18,8 +18,8 @@ import torch
 
 from dro_grasp.cli.main import main as command
 from dro_grasp.network.checkpoints import load_weights
-from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
-from dro_grasp.train.measures import distance_errors
+from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
+from dro_grasp.training.measures import distance_errors
 from lab.benchmarks.report import ROOT, emit
 from lab.benchmarks.synthesis import HANDS
 

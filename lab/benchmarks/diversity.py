@@ -19,7 +19,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.sources.network import ProposalConfig
-from dro_grasp.train.data.collections.merging import file_name
+from dro_grasp.training.data.collections.merging import file_name
 from lab.benchmarks.report import ROOT, emit
 from lab.benchmarks.synthesis import HANDS
 

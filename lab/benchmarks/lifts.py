@@ -41,7 +41,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.controls import MeanGrasp, mean_grasps
 from dro_grasp.predict.stages import complete
-from dro_grasp.train.data.bundle.training_file import load_bundle
+from dro_grasp.training.data.bundle.training_file import load_bundle
 from lab.benchmarks.report import emit
 
 ROWS = {

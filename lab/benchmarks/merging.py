@@ -19,7 +19,7 @@ import torch
 
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.train.data.engine.shards import Shard, Yield, notes_of
+from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
 from lab.benchmarks.report import emit
 from tests.helpers.tiny_bundle import made_up_grasps
 

@@ -25,7 +25,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.network import ProposalConfig
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.train.data.bundle.training_file import HELD_OUT_HANDS
+from dro_grasp.training.data.bundle.training_file import HELD_OUT_HANDS
 from lab.benchmarks.report import emit, rate
 
 PROTOCOLS = ("dro", "strict")

@@ -19,10 +19,10 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.network import DistanceNetwork
-from dro_grasp.train.config import AugmentationConfig
-from dro_grasp.train.data.bundle.training_file import Bundle, HandGrasps, ObjectCloud, load_bundle
-from dro_grasp.train.measures import mean_rank
-from dro_grasp.train.samples import SampleSource
+from dro_grasp.training.config import AugmentationConfig
+from dro_grasp.training.data.bundle.training_file import Bundle, HandGrasps, ObjectCloud, load_bundle
+from dro_grasp.training.measures import mean_rank
+from dro_grasp.training.samples import SampleSource
 from lab.benchmarks.report import emit
 
 POSES = 64

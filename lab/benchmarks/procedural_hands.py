@@ -10,8 +10,8 @@ from collections import Counter
 from pathlib import Path
 
 from dro_grasp.compare.metrics import wilson_interval
-from dro_grasp.train.data.engine.shards import Yield, find_shards, read_yield
-from dro_grasp.train.made_hands.making import make_hand
+from dro_grasp.training.data.engine.shards import Yield, find_shards, read_yield
+from dro_grasp.training.made_hands.making import make_hand
 
 VARIED = ("family", "fingers", "side", "thumb", "palm", "folds_back")
 """Facts whose counts are printed."""

@@ -23,7 +23,7 @@ from dro_grasp.grasps.batch import DUPLICATE_DISTANCE
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig
-from dro_grasp.train.data.engine.worker import EngineConfig, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
 from lab.benchmarks.report import emit
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")

@@ -9,8 +9,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from dro_grasp.train.data.engine.schedule import DatasetReport, synthesize_dataset
-from dro_grasp.train.data.engine.worker import EngineConfig
+from dro_grasp.training.data.engine.schedule import DatasetReport, synthesize_dataset
+from dro_grasp.training.data.engine.worker import EngineConfig
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS
 

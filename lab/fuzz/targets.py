@@ -32,10 +32,10 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import load_scan
-from dro_grasp.train.data.bundle.training_file import ObjectCloud, load_bundle, write_bundle
-from dro_grasp.train.data.collections.collection import count_collection, read_collection
-from dro_grasp.train.data.collections.importing import read_foreign
-from dro_grasp.train.runs import CHECKPOINT, LOG, RunFolder
+from dro_grasp.training.data.bundle.training_file import ObjectCloud, load_bundle, write_bundle
+from dro_grasp.training.data.collections.collection import count_collection, read_collection
+from dro_grasp.training.data.collections.importing import read_foreign
+from dro_grasp.training.runs import CHECKPOINT, LOG, RunFolder
 from lab.fuzz import mutations as damage
 
 Rng = random.Random

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dro_grasp.errors import BundleError
 from dro_grasp.hands.hand import Hand
-from dro_grasp.train.data.bundle.training_file import Bundle
+from dro_grasp.training.data.bundle.training_file import Bundle
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.kinds import Checked
-from dro_grasp.train.config import ScheduleConfig
-from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.runs import Losses, Report, TrainingRun, begin, recalibrate, run_plan
+from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, recalibrate, run_plan
 from lab.methods.bundle_draws import BundleDraws
 
 Network = TypeVar("Network", bound=nn.Module)

@@ -15,9 +15,9 @@ import tyro
 
 from dro_grasp.files import check_output
 from dro_grasp.network.checkpoints import save_weights
-from dro_grasp.train.config import ScheduleConfig
-from dro_grasp.train.data.bundle.training_file import load_bundle
-from dro_grasp.train.runs import check_schedule, is_first, last_logged
+from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.data.bundle.training_file import load_bundle
+from dro_grasp.training.runs import check_schedule, is_first, last_logged
 from lab.methods.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
 from lab.methods.manifm.contact_training import ContactTrainingConfig, train_contacts
 

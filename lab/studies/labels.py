@@ -26,7 +26,7 @@ from dro_grasp.optimize.starts import StartConfig
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.train.data.engine.worker import EngineConfig, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS, training_objects
 

@@ -24,9 +24,9 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.encoder import StaticGraphEncoder
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.train.config import AugmentationConfig
-from dro_grasp.train.measures import matching_rank, mean_rank
-from dro_grasp.train.samples import SampleSource
+from dro_grasp.training.config import AugmentationConfig
+from dro_grasp.training.measures import matching_rank, mean_rank
+from dro_grasp.training.samples import SampleSource
 from lab.benchmarks.distance_error import validation_bundle
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS

@@ -33,12 +33,12 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.train.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
-from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
-from dro_grasp.train.loop import train
-from dro_grasp.train.measures import distance_errors
-from dro_grasp.train.pretraining import pretrain
-from dro_grasp.train.runs import last_logged
+from dro_grasp.training.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
+from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
+from dro_grasp.training.loop import train
+from dro_grasp.training.measures import distance_errors
+from dro_grasp.training.pretraining import pretrain
+from dro_grasp.training.runs import last_logged
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS
 

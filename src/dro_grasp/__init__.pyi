@@ -68,7 +68,7 @@ from .simulation.contacts import ContactQuality as ContactQuality, measure_conta
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate
-from .train.config import (
+from .training.config import (
     AugmentationConfig as AugmentationConfig,
     LossConfig as LossConfig,
     MotionConfig as MotionConfig,
@@ -76,11 +76,11 @@ from .train.config import (
     ScheduleConfig as ScheduleConfig,
     TrainConfig as TrainConfig,
 )
-from .train.data.bundle.training_file import load_bundle as load_bundle
-from .train.data.collections.bundling import make_bundle as make_bundle
-from .train.data.collections.collection import read_collection as read_collection
-from .train.data.engine.schedule import synthesize_dataset as synthesize_dataset
-from .train.data.engine.worker import EngineConfig as EngineConfig
-from .train.loop import train as train
-from .train.made_hands.making import MadeHand as MadeHand, make_hand as make_hand
-from .train.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
+from .training.data.bundle.training_file import load_bundle as load_bundle
+from .training.data.collections.bundling import make_bundle as make_bundle
+from .training.data.collections.collection import read_collection as read_collection
+from .training.data.engine.schedule import synthesize_dataset as synthesize_dataset
+from .training.data.engine.worker import EngineConfig as EngineConfig
+from .training.loop import train as train
+from .training.made_hands.making import MadeHand as MadeHand, make_hand as make_hand
+from .training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion

@@ -22,7 +22,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 from dro_grasp.simulation.trial import record, settle, simulate
-from dro_grasp.train.data.engine.worker import EngineConfig
+from dro_grasp.training.data.engine.worker import EngineConfig
 from tests.helpers.served_studio import Listener, asked, served_studio
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "source": "auto"}

@@ -19,7 +19,7 @@ from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.train.data.collections import checking
+from dro_grasp.training.data.collections import checking
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited

@@ -12,7 +12,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.cli.output import print_table
 from dro_grasp.grasps.batch import percent
 from dro_grasp.network.checkpoints import SMALL, weights_names
-from dro_grasp.train.data.collections.report import LABEL, short_names
+from dro_grasp.training.data.collections.report import LABEL, short_names
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 

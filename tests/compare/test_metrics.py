@@ -23,7 +23,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.controls import CHOICE_POINTS, mean_grasps, palm_facing_starts
-from dro_grasp.train.data.bundle.training_file import Bundle
+from dro_grasp.training.data.bundle.training_file import Bundle
 from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
 from tests.helpers.toy_hand import toy_hand
 

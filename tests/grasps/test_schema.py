@@ -16,7 +16,7 @@ from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
 from dro_grasp.grasps.grasp_file import METADATA_KEY, read_footer
-from dro_grasp.train.data.collections.collection import count_collection
+from dro_grasp.training.data.collections.collection import count_collection
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 

@@ -16,9 +16,9 @@ import dro_grasp as dro
 from dro_grasp.errors import OptionError
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.description.loader import load_description, self_penetration
-from dro_grasp.train.made_hands.making import make_hand, posture, why_unfit
-from dro_grasp.train.made_hands.plan import FingerPlan, HandPlan, write_urdf
-from dro_grasp.train.made_hands.sampling import sample_plan
+from dro_grasp.training.made_hands.making import make_hand, posture, why_unfit
+from dro_grasp.training.made_hands.plan import FingerPlan, HandPlan, write_urdf
+from dro_grasp.training.made_hands.sampling import sample_plan
 from tests.helpers.claw_urdf import joint, link, written
 
 

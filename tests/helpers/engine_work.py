@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from dro_grasp.errors import HandError, ObjectError
-from dro_grasp.train.data.engine.shards import Yield, notes_of
-from dro_grasp.train.data.engine.worker import FinishedShard, Job, Task
-from tests.train.data.test_shards import grasps
+from dro_grasp.training.data.engine.shards import Yield, notes_of
+from dro_grasp.training.data.engine.worker import FinishedShard, Job, Task
+from tests.training.data.test_shards import grasps
 
 GRASPS = 5
 """Grasps of a shard."""

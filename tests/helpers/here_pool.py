@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dro_grasp.train.data.engine.pools import Outcome, Work, failure_of
-from dro_grasp.train.data.engine.schedule import synthesize_dataset
-from dro_grasp.train.data.engine.worker import Job, Task
+from dro_grasp.training.data.engine.pools import Outcome, Work, failure_of
+from dro_grasp.training.data.engine.schedule import synthesize_dataset
+from dro_grasp.training.data.engine.worker import Job, Task
 from tests.helpers.engine_work import easy
 
 

@@ -12,7 +12,7 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.network.presets import NetworkConfig
-from dro_grasp.train.data.bundle.training_file import Bundle, ObjectCloud, write_bundle
+from dro_grasp.training.data.bundle.training_file import Bundle, ObjectCloud, write_bundle
 from tests.helpers.toy_hand import toy_hand
 
 TINY = NetworkConfig(

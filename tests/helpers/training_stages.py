@@ -8,11 +8,11 @@ from pathlib import Path
 
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.network.presets import NetworkConfig
-from dro_grasp.train.config import PretrainConfig, ScheduleConfig, TrainConfig
-from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.loop import train
-from dro_grasp.train.pretraining import pretrain
-from dro_grasp.train.runs import LOG, Report, RunProgress
+from dro_grasp.training.config import PretrainConfig, ScheduleConfig, TrainConfig
+from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.loop import train
+from dro_grasp.training.pretraining import pretrain
+from dro_grasp.training.runs import LOG, Report, RunProgress
 from tests.helpers.tiny_bundle import TINY
 
 SCHEDULE = ScheduleConfig(

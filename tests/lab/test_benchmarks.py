@@ -17,9 +17,9 @@ from scipy.stats import ttest_rel
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import GraspRequest
-from dro_grasp.train import loop, pretraining
-from dro_grasp.train.data.bundle.training_file import write_bundle
-from dro_grasp.train.data.collections.importing import read_foreign
+from dro_grasp.training import loop, pretraining
+from dro_grasp.training.data.bundle.training_file import write_bundle
+from dro_grasp.training.data.collections.importing import read_foreign
 from lab.benchmarks import comparison, dexgraspbench, dexgraspbench_official
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand

@@ -16,7 +16,7 @@ from dro_grasp.errors import WeightsError
 from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.train.config import ScheduleConfig
+from dro_grasp.training.config import ScheduleConfig
 from lab.methods import train
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.gendexgrasp import contact_maps, map_method

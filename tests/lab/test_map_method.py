@@ -14,7 +14,7 @@ from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.objects.loading import object_in_memory
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.train.runs import recalibrate
+from dro_grasp.training.runs import recalibrate
 from lab.methods.gendexgrasp.map_fitting import FittingConfig
 from lab.methods.gendexgrasp.map_method import ContactMapMethod
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from dro_grasp.errors import BundleError, TrainingError
-from dro_grasp.train.config import ScheduleConfig
-from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.runs import RunFolder
+from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.runs import RunFolder
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.point_autoencoder import AutoencoderConfig, divergence, each, layer, train_autoencoder
 

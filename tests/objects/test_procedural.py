@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import FAMILIES, SIZE, THINNEST, Solid, procedural_object
 from dro_grasp.objects.catalogue import load_object, locate_object, resolve_objects
-from dro_grasp.train.data.engine.schedule import require_distinct, require_known
+from dro_grasp.training.data.engine.schedule import require_distinct, require_known
 
 SEEDS = range(16)
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.runs import Losses, Report, console_report
+from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.runs import Losses, Report, console_report
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.gendexgrasp.contact_maps import TRAINING_GAMMA, contact_map
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork, MapOutput

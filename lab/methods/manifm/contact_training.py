@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.hands.hand import Hand
-from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.runs import Losses, Report, console_report
+from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.runs import Losses, Report, console_report
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.manifm.contact_network import LATENT, ContactNetwork, ContactOutput
 from lab.methods.manifm.fingertip_contacts import ContactMaps, contact_maps

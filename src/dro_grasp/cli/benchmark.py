@@ -136,7 +136,7 @@ class Benchmark:
     def _methods(self) -> list[Method]:
         """The methods that were named, or the network and its controls."""
         from dro_grasp.compare.methods import MethodOptions, make_method
-        from dro_grasp.train.data.bundle.training_file import load_bundle
+        from dro_grasp.training.data.bundle.training_file import load_bundle
 
         names = self.methods
         if not names:

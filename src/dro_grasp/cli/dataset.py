@@ -15,9 +15,9 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.train.data.collections.collection import PairGrasps
-    from dro_grasp.train.data.engine.pools import Pool
-    from dro_grasp.train.data.engine.worker import Job
+    from dro_grasp.training.data.collections.collection import PairGrasps
+    from dro_grasp.training.data.engine.pools import Pool
+    from dro_grasp.training.data.engine.worker import Job
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Synthesize:
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimize.contacts import ContactConfig
         from dro_grasp.optimize.synthesis import SynthesisConfig
-        from dro_grasp.train.data.engine.schedule import require_distinct, require_known, synthesize_dataset
-        from dro_grasp.train.data.engine.worker import EngineConfig
+        from dro_grasp.training.data.engine.schedule import require_distinct, require_known, synthesize_dataset
+        from dro_grasp.training.data.engine.worker import EngineConfig
 
         self._check_numbers()
         objects = resolve_objects(list(self.object))
@@ -103,7 +103,7 @@ class Synthesize:
         return int(found[1]), int(found[2])
 
     def _ray_pool(self, job: Job) -> Pool:
-        from dro_grasp.train.data.engine.pools import RayPool
+        from dro_grasp.training.data.engine.pools import RayPool
 
         return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)
 
@@ -129,8 +129,8 @@ class Import:
         """Read all files, find hands and objects, write grasp files."""
         from dro_grasp.errors import GraspFileError
         from dro_grasp.files import check_folder, make_folder
-        from dro_grasp.train.data.collections.importing import import_grasps
-        from dro_grasp.train.data.collections.merging import file_name
+        from dro_grasp.training.data.collections.importing import import_grasps
+        from dro_grasp.training.data.collections.merging import file_name
 
         check_folder(self.output)
         here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
@@ -163,7 +163,7 @@ class Info:
 
     def run(self) -> int:
         """Count."""
-        from dro_grasp.train.data.collections.collection import count_collection
+        from dro_grasp.training.data.collections.collection import count_collection
 
         counts = count_collection(self.folder)
         total = sum(sum(c.values()) for c in counts.values())
@@ -182,8 +182,8 @@ class DataSets:
 
     def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
         """The grasps of each pair in them; refuses two hands of one name, which cannot join in one file or table."""
-        from dro_grasp.train.data.collections.collection import read_collection
-        from dro_grasp.train.data.collections.coverage import of_one_version
+        from dro_grasp.training.data.collections.collection import read_collection
+        from dro_grasp.training.data.collections.coverage import of_one_version
 
         return of_one_version((path, pair) for path in self.inputs for pair in read_collection(path, only_successful))
 
@@ -201,8 +201,8 @@ class Report(DataSets):
     def run(self) -> int:
         """Measure, print, write the page."""
         from dro_grasp.files import check_output
-        from dro_grasp.train.data.collections.coverage import measure_coverage
-        from dro_grasp.train.data.collections.report import write_report
+        from dro_grasp.training.data.collections.coverage import measure_coverage
+        from dro_grasp.training.data.collections.report import write_report
 
         output = None if self.output is None else check_output(self.output, ".html")
         hands = measure_coverage(self.pairs(only_successful=True))
@@ -235,7 +235,7 @@ class Merge(DataSets):
     def run(self) -> int:
         """Merge, and write the files."""
         from dro_grasp.files import make_folder
-        from dro_grasp.train.data.collections.merging import file_name, merge, require_choice
+        from dro_grasp.training.data.collections.merging import file_name, merge, require_choice
 
         require_choice(self.per_pair)
         folder = make_folder(self.output)
@@ -270,7 +270,7 @@ class Check(DataSets):
         """Draw, evaluate, compare."""
         from dro_grasp.compare.metrics import wilson_interval
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.train.data.collections.checking import check
+        from dro_grasp.training.data.collections.checking import check
 
         rules = changed(self.protocol, friction=self.friction, mass_factor=self.mass_factor)
         with progress_bar("evaluating", self.json) as progress:
@@ -307,9 +307,9 @@ class Filter(DataSets):
         from dro_grasp.files import make_folder
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.train.data.collections.checking import keep_passing
-        from dro_grasp.train.data.collections.collection import yield_notes
-        from dro_grasp.train.data.collections.merging import file_name
+        from dro_grasp.training.data.collections.checking import keep_passing
+        from dro_grasp.training.data.collections.collection import yield_notes
+        from dro_grasp.training.data.collections.merging import file_name
 
         rules = changed(self.protocol, friction=self.friction)
         folder = make_folder(self.output)
@@ -351,7 +351,7 @@ class BundleCommand(DataSets):
         """Select the grasps of the split, find their hands and objects, write the bundle."""
         from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.train.data.collections.bundling import make_bundle
+        from dro_grasp.training.data.collections.bundling import make_bundle
 
         output = check_output(self.output, ".safetensors")
         further = [load_hand(name) for name in self.hands_without_grasps]

@@ -15,7 +15,7 @@ from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say
 
 if TYPE_CHECKING:
-    from dro_grasp.train.made_hands.making import MadeHand
+    from dro_grasp.training.made_hands.making import MadeHand
 
 LISTING = "hands.csv"  # File in the folder that lists its hands
 
@@ -42,7 +42,7 @@ class Make:
         """Make, write, list and draw."""
         from dro_grasp.errors import OptionError, OutputError
         from dro_grasp.files import check_output, make_folder, replacing
-        from dro_grasp.train.made_hands.making import hand_name, make_hand
+        from dro_grasp.training.made_hands.making import hand_name, make_hand
 
         if self.num < 1:
             raise OptionError(f"--num is {self.num}; give at least 1")

@@ -36,7 +36,7 @@ class Onboard:
 
     def run(self) -> int:
         """Run all steps, then write the report."""
-        from dro_grasp.train.onboarding import WEIGHTS, OnboardingConfig, onboard, write_report
+        from dro_grasp.training.onboarding import WEIGHTS, OnboardingConfig, onboard, write_report
 
         config = OnboardingConfig(
             self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, self.source, seed=self.seed,

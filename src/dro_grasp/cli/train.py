@@ -14,7 +14,7 @@ from dro_grasp.cli.output import print_result, print_table, say_aside
 if TYPE_CHECKING:
     from dro_grasp.network.network import DistanceNetwork
     from dro_grasp.network.presets import NetworkConfig
-    from dro_grasp.train.config import ScheduleConfig
+    from dro_grasp.training.config import ScheduleConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +63,8 @@ class Stage:
     def schedule(self, **more: Any) -> ScheduleConfig:
         """The schedule, which can be carried out here."""
         from dro_grasp.devices import choose_device
-        from dro_grasp.train.config import ScheduleConfig
-        from dro_grasp.train.runs import check_schedule
+        from dro_grasp.training.config import ScheduleConfig
+        from dro_grasp.training.runs import check_schedule
 
         schedule = ScheduleConfig(
             learning_rate=self.learning_rate, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
@@ -92,12 +92,12 @@ class Pretrain(Stage):
 
         from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.train.config import AugmentationConfig, MotionConfig, PretrainConfig
-        from dro_grasp.train.data.bundle.training_file import load_bundle
-        from dro_grasp.train.measures import matching_rank
-        from dro_grasp.train.pretraining import pretrain, pretrain_motion
-        from dro_grasp.train.runs import is_first
-        from dro_grasp.train.samples import SampleSource
+        from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
+        from dro_grasp.training.data.bundle.training_file import load_bundle
+        from dro_grasp.training.measures import matching_rank
+        from dro_grasp.training.pretraining import pretrain, pretrain_motion
+        from dro_grasp.training.runs import is_first
+        from dro_grasp.training.samples import SampleSource
 
         check_output(self.output, ".safetensors")
         initial = None if self.initial is None else load_weights(self.initial)
@@ -164,11 +164,11 @@ class Train(Stage):
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.train.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
-        from dro_grasp.train.data.bundle.training_file import load_bundle
-        from dro_grasp.train.loop import train, train_placement
-        from dro_grasp.train.measures import distance_errors
-        from dro_grasp.train.runs import is_first
+        from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
+        from dro_grasp.training.data.bundle.training_file import load_bundle
+        from dro_grasp.training.loop import train, train_placement
+        from dro_grasp.training.measures import distance_errors
+        from dro_grasp.training.runs import is_first
 
         check_output(self.output, ".safetensors")
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
@@ -215,7 +215,7 @@ class Train(Stage):
 
 def how_long(run_folder: Path) -> dict[str, int]:
     """Steps and seconds that a run took."""
-    from dro_grasp.train.runs import last_logged
+    from dro_grasp.training.runs import last_logged
 
     last = last_logged(run_folder)
     return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

@@ -1,0 +1,100 @@
+"""Evaluate stored grasps again: do their verdicts hold, and which grasps pass another protocol?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.scene import require_simulable
+from dro_grasp.simulation.trial import simulate
+from dro_grasp.training.data.collections.collection import PairGrasps, Sources
+from dro_grasp.training.data.engine.worker import closed_where_it_holds
+
+Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps in all)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Stored verdicts against those of new trials, for some grasps."""
+
+    protocol: str  # of the new trials
+    evaluated: int = 0
+    agreed: int = 0  # of the trials, those with the stored verdict
+    succeeded: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)  # why stored successes fail now, counted
+    hands: dict[str, tuple[int, int]] = field(default_factory=dict)  # trials and successes by hand
+
+    @property
+    def share(self) -> float:
+        """Share of the new trials with the stored verdict."""
+        return self.agreed / self.evaluated
+
+    def extended(self, grasps: GraspBatch, trial: TrialResult) -> Agreement:
+        """With the new trials of more grasps."""
+        failed = Counter(f.value for f, held in zip(trial.failure, grasps.trial_success.tolist(), strict=True) if f and held)
+        success, agreed = int(trial.success.sum()), int((trial.success == grasps.trial_success).sum())
+        of_hand = self.hands.get(grasps.hand, (0, 0))
+        return replace(
+            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + agreed,
+            succeeded=self.succeeded + success, reasons=self.reasons + failed,
+            hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
+        )
+
+
+def check(
+    pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
+) -> Agreement:
+    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts."""
+    if sample < 1:
+        raise OptionError(f"sample is {sample}; check at least one grasp")
+    parts = [pair.grasps for pair in pairs if len(pair.grasps)]
+    sizes = [len(grasps) for grasps in parts]
+    if not parts:
+        raise GraspFileError("the data set holds no grasp; there is nothing to check")
+    order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(seed))
+    chosen = torch.zeros(sum(sizes), dtype=torch.bool)
+    chosen[order[:sample]] = True
+    drawn = [grasps[mask] for grasps, mask in zip(parts, chosen.split(sizes), strict=True) if mask.any()]
+    result = Agreement(rules.label)
+    for grasps, (hand, obj) in zip(drawn, _loaded(drawn, progress), strict=True):
+        result = result.extended(grasps, simulate(hand, obj, grasps, rules))
+    return result
+
+
+def keep_passing(
+    pairs: Iterable[PairGrasps], rules: Protocol, progress: Progress | None = None, close_fingers: bool = False
+) -> list[tuple[PairGrasps, GraspBatch]]:
+    """Evaluate all grasps and keep those that pass, with their new results: each pair and the grasps left of it.
+
+    With `close_fingers`, idle fingers are closed as `closed_where_it_holds` does.
+    """
+    parts = [pair for pair in pairs if len(pair.grasps)]
+    kept = []
+    for pair, (hand, obj) in zip(parts, _loaded([pair.grasps for pair in parts], progress), strict=True):
+        grasps = pair.grasps.with_trial(simulate(hand, obj, pair.grasps, rules))
+        if close_fingers:
+            grasps = closed_where_it_holds(hand, obj, grasps, rules)
+        kept.append((pair, grasps[grasps.success]))
+    return kept
+
+
+def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
+    total, done, sources = sum(map(len, parts)), 0, Sources()
+    # All are found before the first trial: none is lost to a file that has changed, or to a bare cloud.
+    pairs = [sources.of(grasps) for grasps in parts]
+    for pair in pairs:
+        require_simulable(*pair)
+    for grasps, pair in zip(parts, pairs, strict=True):
+        yield pair
+        done += len(grasps)
+        if progress is not None:
+            progress(done, total)

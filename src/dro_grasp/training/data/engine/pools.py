@@ -1,0 +1,234 @@
+"""Pools, which make shards side by side: what every pool does, processes on this machine, a Ray cluster of any size.
+
+Files travel as bytes, so the nodes of a cluster need no shared folder. Hands and objects named by path must lie at that path
+on every node, and every node needs the same version of dro-grasp.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from pebble import ProcessExpired, ProcessPool
+
+from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.extras import require_extra
+from dro_grasp.training.data.engine.threads import use_one_thread
+from dro_grasp.training.data.engine.worker import FinishedShard, Job, Task, make_shard
+
+if TYPE_CHECKING:
+    import ray
+
+
+Work = Callable[[Job, Task], FinishedShard]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A shard that could not be made."""
+
+    reason: str  # in one line
+    died: bool = False  # the worker died or was stopped: a new attempt may succeed
+
+
+Outcome = tuple[Task, FinishedShard | Failed]
+
+
+@runtime_checkable
+class Pool(Protocol):
+    """Something that makes shards side by side."""
+
+    @property
+    def free(self) -> int:
+        """Number of shards that it would start at once."""
+        ...
+
+    def submit(self, task: Task) -> None:
+        """Start a shard."""
+        ...
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        """Shards that ended, as soon as there is one; none after `timeout` [s]."""
+        ...
+
+    def close(self) -> None:
+        """Stop everything; shards in flight are dropped."""
+        ...
+
+
+def failure_of(error: BaseException) -> Failed:
+    """An error of one shard in one line."""
+    reason = str(error) if isinstance(error, DroGraspError) else f"{type(error).__name__}: {error}"
+    return Failed(reason.splitlines()[0][:300] if reason else type(error).__name__)
+
+
+def attempt(work: Work, job: Job, task: Task) -> FinishedShard | Failed:
+    """Make a shard; an error becomes a value, as it must not stop the other shards."""
+    try:
+        return work(job, task)
+    except Exception as error:  # a fault of ours too: `failure_of` names it
+        return failure_of(error)
+
+
+class LocalPool:
+    """Processes of one thread each on this machine. A worker's death costs the shard it was making, no other.
+
+    Each process has a pebble pool of its own. Processes of one pool share a lock, and one that is killed while it hands
+    over its shard would keep the lock from the others.
+    """
+
+    def __init__(self, job: Job, workers: int, limit: float, work: Work = make_shard) -> None:
+        """Prepare the processes; each starts with its first shard. One that takes longer than the limit [s] is stopped."""
+        self.job, self.limit, self.work = job, limit, work
+        self.idle = [_one_process() for _ in range(workers)]
+        self.busy: dict[Future[FinishedShard | Failed], tuple[Task, ProcessPool]] = {}
+
+    @property
+    def free(self) -> int:
+        """Idle processes."""
+        return len(self.idle)
+
+    def submit(self, task: Task) -> None:
+        """Hand a shard to an idle process."""
+        pool = self.idle.pop()
+        try:
+            future = pool.schedule(attempt, (self.work, self.job, task), timeout=self.limit)
+        except RuntimeError:  # its process died while idle
+            pool = _replaced(pool)
+            future = pool.schedule(attempt, (self.work, self.job, task), timeout=self.limit)
+        self.busy[future] = task, pool
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        """Finished shards, errors, and shards whose process died or took too long."""
+        done, _ = wait(self.busy, timeout, FIRST_COMPLETED)
+        return [self._collect(future) for future in done]
+
+    def close(self) -> None:
+        """End the processes."""
+        pools = [*self.idle, *(pool for _, pool in self.busy.values())]
+        with ThreadPoolExecutor(len(pools)) as threads:
+            list(threads.map(_end, pools))
+
+    def _collect(self, future: Future[FinishedShard | Failed]) -> Outcome:
+        task, pool = self.busy.pop(future)
+        try:
+            result = future.result()
+        except TimeoutError:
+            result = Failed(f"took longer than {self.limit:.0f} s", died=True)
+        except ProcessExpired as error:
+            result, pool = Failed(f"its worker process died (exit code {error.exitcode})", died=True), _replaced(pool)
+        except BrokenProcessPool:
+            result, pool = Failed("its worker process died before it began", died=True), _replaced(pool)
+        except Exception as error:  # a result that cannot be handed over: pickling runs code of any kind
+            result = failure_of(error)
+        self.idle.append(pool)
+        return task, result
+
+
+def _one_process() -> ProcessPool:
+    return ProcessPool(1, initializer=use_one_thread, context=multiprocessing.get_context("spawn"))
+
+
+def _end(pool: ProcessPool) -> None:
+    pool.stop()
+    pool.join()
+
+
+def _replaced(pool: ProcessPool) -> ProcessPool:
+    _end(pool)
+    return _one_process()
+
+
+CONNECT_TIME = 5.0  # Longest wait for a cluster's head to accept a connection [s]. Ours
+GPU_SHARE = 0.25
+"""Share of a GPU for a shard whose energies are computed there. Ours: trials, on the CPU, take most of its time."""
+RETRIES = 3
+"""Times that Ray starts a shard again elsewhere when its process or node is gone. Ours; a shard depends on its seed alone."""
+
+
+class RayPool:
+    """Tasks of a Ray cluster, one CPU each."""
+
+    def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
+        """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
+
+        `address` is that of the cluster's head, `host:port`, or `auto` for the one that runs here; without it RAY_ADDRESS
+        counts, and without both a cluster starts on this machine.
+        """
+        require_extra("ray")
+        import ray
+
+        self.limit, self.started_here = limit, False
+        if not ray.is_initialized():
+            self.started_here = True
+            _connect(address or os.environ.get("RAY_ADDRESS"), workers)
+        self.ray, self.work = ray, work
+        self.job = ray.put(job)
+        options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        if job.config.synthesis.device != "cpu":
+            options["num_gpus"] = GPU_SHARE
+        # Errors come back as values, so Ray retries lost machines and nothing else.
+        self.start = ray.remote(**options)(attempt)
+        self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
+
+    @property
+    def free(self) -> int:
+        """CPUs of the cluster now, less the shards in flight; at least one shard may wait for a node."""
+        cpus = max(1, int(self.ray.cluster_resources().get("CPU", 0)))
+        return max(0, cpus - len(self.running))
+
+    def submit(self, task: Task) -> None:
+        """Hand a shard to the cluster."""
+        self.running[self.start.remote(self.work, self.job, task)] = (task, time.monotonic())
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        """Finished shards, errors, and shards whose machine is gone for good or that took too long."""
+        done, _ = self.ray.wait(list(self.running), num_returns=1, timeout=timeout)
+        outcomes = [self._collect(ref) for ref in done]
+        for ref in [r for r, (_, since) in self.running.items() if time.monotonic() - since > self.limit]:
+            self.ray.cancel(ref, force=True)
+            outcomes.append((self.running.pop(ref)[0], Failed(f"took longer than {self.limit:.0f} s", died=True)))
+        return outcomes
+
+    def close(self) -> None:
+        """Cancel what runs, and leave the cluster if this pool joined it."""
+        for ref in self.running:
+            self.ray.cancel(ref, force=True)
+        if self.started_here:
+            self.ray.shutdown()
+
+    def _collect(self, ref: ray.ObjectRef) -> Outcome:
+        task = self.running.pop(ref)[0]
+        try:
+            return task, self.ray.get(ref)
+        except self.ray.exceptions.RayError as error:
+            return task, Failed(f"its Ray worker was lost ({type(error).__name__})", died=True)
+
+
+def _connect(address: str | None, workers: int) -> None:
+    import ray
+
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        return
+    try:
+        _knock(address)
+        ray.init(address=address, **quiet)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
+                          "give the address that it prints") from error
+
+
+def _knock(address: str) -> None:
+    """Check in seconds that something listens at `host:port`; Ray itself waits for minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), CONNECT_TIME).close()

@@ -1,0 +1,185 @@
+"""The work of one shard: synthesize candidates, close the hand on the object, keep those that pass the trial."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import torch
+
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch, distinct
+from dro_grasp.grasps.columns import DEPTH, RELABELLED
+from dro_grasp.grasps.sources import with_sources
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.kinds import Checked
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize.fingers import close_idle_fingers
+from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
+from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.trial import hand_shift, settle, simulate
+from dro_grasp.training.data.bundle.training_file import split_of
+from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
+
+LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
+
+
+@dataclass(frozen=True)
+class EngineConfig(Checked):
+    """Settings of a data set's production."""
+
+    protocol: str = "strict"
+    """Trial that grasps must pass."""
+    scale: float = 1.0
+    """Multiplies the coordinates of all objects."""
+    seconds: float | None = None
+    """No new shard starts after this time [s]; those in flight are finished. None for no limit."""
+    candidates: int = 256
+    """Candidates of a pair's first shard; the size of later shards follows the pair's yield."""
+    min_candidates: int = 128
+    """Smallest later shard."""
+    max_candidates: int = 768
+    """Largest later shard."""
+    trial_share: float = 0.7
+    """Share of the candidates, lowest energy first, that may get a trial."""
+    max_penetration: float = 0.01
+    """Candidates that penetrate deeper by the signed distances get no trial [m]."""
+    settle: bool = True
+    """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
+    max_shift: float = 0.03
+    """Candidates that closing moves farther relative to the object get no trial [m]."""
+    min_contact_links: int = 2
+    """Links that must touch the object after closing; with fewer, a success is a cage or luck (ours)."""
+    close_fingers: bool = True
+    """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
+    max_barren_rounds: int = 3
+    """A pair is given up after this many rounds in a row without a valid grasp."""
+    candidate_budget: int = 8192
+    """A pair is given up after this many candidates."""
+    max_crashes: int = 2
+    """A pair is given up after this many deaths of workers in a row."""
+    shard: tuple[int, int] = (1, 1)
+    """Which part of the pairs this run fills, and of how many: (3, 16) is the third of sixteen, as `--shard 3/16`. Runs of all
+    parts may fill one folder at the same time, and together make the same grasps as one run."""
+    shard_seconds: float = 1800.0
+    """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object."""
+    synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
+    """The optimiser."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.shard[0] <= self.shard[1]:
+            raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
+
+
+@dataclass(frozen=True)
+class Job:
+    """Settings that all shards of a run share."""
+
+    seed: int
+    config: EngineConfig
+
+
+@dataclass(frozen=True)
+class Task:
+    """One shard to make."""
+
+    shard: Shard
+    candidates: int
+    earlier: tuple[bytes, ...] = ()  # the pair's shards so far, as files; a grasp close to one of theirs is a duplicate
+
+
+@dataclass(frozen=True)
+class FinishedShard:
+    """The outcome of one task."""
+
+    shard: Shard
+    payload: bytes  # the shard's file
+    result: Yield
+
+
+def shard_seed(seed: int, shard: Shard) -> int:
+    """A seed of its own for every shard, the same on every machine."""
+    text = f"{seed}/{shard.hand}/{shard.object}/{shard.round}".encode()
+    return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
+
+
+_hand = lru_cache(maxsize=16)(load_hand)
+_object = lru_cache(maxsize=16)(load_object)
+
+
+def make_shard(job: Job, task: Task) -> FinishedShard:
+    """Make one shard. Files come and go as bytes, so that it runs on machines without the folder."""
+    started = time.process_time()
+    hand, obj = _hand(task.shard.hand), _object(task.shard.object, scale=job.config.scale)
+    _ = obj.distance_field, obj.parts
+    prepared = time.process_time()
+    earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
+    grasps, result = valid_grasps(
+        hand, obj, shard_seed(job.seed, task.shard), job.config, task.candidates,
+        GraspBatch.concatenate(earlier) if earlier else None)
+    grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.config.scale)
+    grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
+    result = dataclasses.replace(result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started)
+    return FinishedShard(task.shard, grasps.to_bytes(notes_of(result)), result)
+
+
+def valid_grasps(
+    hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig, candidates: int | None = None,
+    earlier: GraspBatch | None = None,
+) -> tuple[GraspBatch, Yield]:
+    """Candidates of one seed that pass the protocol, best energy first, without near-duplicates of them and of earlier ones."""
+    count = candidates or config.candidates
+    drawn = synthesize(hand, obj, count, seed, config.synthesis)
+    ranked = drawn[0 : max(1, round(config.trial_share * count))]
+    grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
+    made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
+    if config.settle and len(grasps):
+        closed = settle(hand, obj, grasps, config.protocol, workers=1)
+        shift = hand_shift(hand, grasps, closed)
+        made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
+        grasps = closed[shift < config.max_shift]
+    trial = simulate(hand, obj, grasps, config.protocol, workers=1)
+    loose = trial.success & (trial.contacts < config.min_contact_links)
+    passed = grasps.with_trial(trial)[trial.success & ~loose]
+    if config.close_fingers and len(passed):
+        passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, workers=1)
+    new = distinct(hand, passed, earlier=earlier)
+    failures = Counter(failure.value for failure in trial.failure if failure)
+    if loose.any():
+        failures[LOOSE] += int(loose.sum())
+    return passed[new], dataclasses.replace(
+        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum()))
+
+
+def closed_where_it_holds(
+    hand: Hand, obj: ObjectModel, evaluated: GraspBatch, protocol: str | Protocol,
+    min_links: int = EngineConfig.min_contact_links, workers: int | None = None,
+) -> GraspBatch:
+    """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
+
+    Column `relabelled` marks them. Their energies stay those by which the grasp was once chosen.
+    """
+    known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
+    relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
+    energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points))
+    closed = close_idle_fingers(energy, evaluated).replace(energy=evaluated.energy, extra=evaluated.extra)
+    rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
+    if not len(rows):
+        return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
+    trial = simulate(hand, obj, closed[rows], protocol, workers=workers)
+    better = trial.success & (trial.contacts >= min_links)
+    better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
+    order = torch.arange(len(evaluated))
+    order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
+    chosen = GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
+    relabelled = relabelled | (order >= len(evaluated))
+    return chosen.replace(extra=chosen.extra | {RELABELLED: relabelled})
