@@ -1,1 +1,1 @@
-"""Web pages and servers alike: who may ask, what may be sent, and how a page looks."""
+"""The viewer and the grasp server, and what their pages share: who may ask, and what may be sent."""

@@ -1,1 +1,1 @@
-"""The grasp energy of a hand on an object: contact candidates, terms and their weighted sum."""
+"""The grasp energy of a hand on an object, and what descends it: synthesis, refinement, fingers and squeeze."""
