@@ -62,7 +62,7 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
     assert found.obstacles is not None
     assert found.obstacles.name == "shelf"
     panel.obstacles.value = NOTHING
-    assert asked(studio, monkeypatch).avoid is None
+    assert asked(studio, monkeypatch).obstacles is None
 
 
 @pytest.mark.parametrize(("field", "text", "message"), [
