@@ -56,9 +56,11 @@ def test_a_source_that_does_not_exist_is_told_before_the_work(capsys) -> None:
         assert "no_hand" not in said
 
 
-def test_the_former_option_is_taken(generate) -> None:
-    with pytest.warns(FutureWarning, match="source 'optimise' is called 'optimiser' now"):
-        assert main(["generate", "--hand", "gripper3", "--object", "no_object", "--method", "optimise"]) == 2
+def test_the_former_option_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "--hand", "gripper3", "--object", "no_object", "--method", "optimise"]) == 2
+    told, error = capsys.readouterr().err.splitlines()
+    assert told == "warning: --method is called --source now, optimise is called optimiser now"
+    assert "no_object" in error
 
 
 def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:

@@ -445,5 +445,5 @@ def test_the_optimiser_alone_asks_no_network(predictor: GraspPredictor, ball: Ob
 def test_what_is_no_source_is_refused_before_any_work() -> None:
     with pytest.raises(OptionError, match="there is no source 'magic'; choose auto, network, optimiser, dfc, start"):
         GraspRequest(source="magic")
-    with pytest.warns(FutureWarning, match="source 'optimise' is called 'optimiser' now"):
+    with pytest.warns(FutureWarning, match="source optimise is called optimiser now"):
         assert GraspRequest(source="optimise").source == "optimiser"

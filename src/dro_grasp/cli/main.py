@@ -92,6 +92,7 @@ def present_options(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
         if now is None:
             gone[option] = value if equals else next(words, "")
             continue
+        told |= {option: now} if now != option else {}
         if now == "--source":
             value = value if equals else next(words, "")
             source = FORMER_SOURCES.get(value, value)
@@ -99,7 +100,6 @@ def present_options(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]
             rest += [now, source] if equals or value else [now]
         else:
             rest.append(now + equals + value)
-        told |= {option: now} if now != option else {}
     if told:
         say_aside("warning: " + ", ".join(f"{old} is called {new} now" for old, new in told.items()))
     return rest, gone

@@ -29,7 +29,7 @@ class Surroundings:
 
     plane: Float[Tensor, "4"] | None = None  # upward unit normal of a plane, and its height along the normal [m]
     obstacles: DistanceField | None = None  # signed distances of other things
-    spared: Balls | None = None  # places where the hand is not wanted
+    keep_out: Balls | None = None  # places where the hand is not wanted
 
     @property
     def up(self) -> Float[Tensor, "3"] | None:
@@ -38,8 +38,8 @@ class Surroundings:
 
     @property
     def parts(self) -> dict[str, Surroundings]:
-        """The same one by one: plane, obstacles, spared."""
-        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "spared")
+        """The same one by one: plane, obstacles, keep_out."""
+        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "keep_out")
                 if (part := getattr(self, name)) is not None}
 
     def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
@@ -47,7 +47,7 @@ class Surroundings:
         distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
         if self.plane is not None:
             distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
-        for part in (self.obstacles, self.spared):
+        for part in (self.obstacles, self.keep_out):
             if part is not None:
                 other, slope = part.distances(points)
                 nearer = other < distance
@@ -66,7 +66,7 @@ class Surroundings:
         """The same on another device."""
         plane = None if self.plane is None else self.plane.to(device)
         obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
-        return Surroundings(plane, obstacles, None if self.spared is None else on_device(self.spared, device))
+        return Surroundings(plane, obstacles, None if self.keep_out is None else on_device(self.keep_out, device))
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Clearance:
         """Surface points, centres and radii of spheres [m], distance to keep [m], weight of the summed penetration [1/m]."""
         self.hand, self.surroundings, self.weight, self.clear = hand, surroundings, weight, clear
         # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
-        filled = surroundings.obstacles is not None or surroundings.spared is not None
+        filled = surroundings.obstacles is not None or surroundings.keep_out is not None
         self.parts = ((body, torch.zeros_like(body.layout[0])), (ball, radii))[: 1 + filled]
         config, moving = ControllerConfig(), hand.movable & ~hand.abduction
         self.postures = [

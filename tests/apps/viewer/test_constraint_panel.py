@@ -34,22 +34,22 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio) -> None:
     trimesh.creation.box(extents=(0.2, 0.2, 0.02), transform=trimesh.transformations.translation_matrix([0.2, 0, 0])).export(
         file, file_type="stl")
     upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
-    studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
+    studio._take(upload, "scene", studio.panel.obstacles, studio._draw_constraints)
     studio._draw_constraints()
-    drawn = [name for name in ("table", "hold0", "hold1", "hold2", "spare0", "spare1", "avoid")
+    drawn = [name for name in ("table", "contact_region0", "contact_region1", "contact_region2", "keep_out0", "keep_out1", "obstacles")
              if studio.client.scene.get_handle_by_name(f"/constraints/{name}") is not None]
-    assert drawn == ["table", "hold0", "hold1", "spare0", "avoid"]
+    assert drawn == ["table", "contact_region0", "contact_region1", "keep_out0", "obstacles"]
     found = asked(studio)[0].constraints
     assert found.direction == (0.0, 0.0, -1.0)
     assert found.max_tilt == pytest.approx(math.radians(30))
     assert found.table == pytest.approx(low, abs=1e-4)
     assert found.contact_region == ((0.0, 0.0, 0.02, 0.05), (0.02, 0.0, 0.0, 0.03))
     assert found.keep_out == ((0.0, 0.0, -0.06, 0.02),)
-    assert found.opening == pytest.approx(0.008)
-    assert found.avoid is not None
-    assert found.avoid.name == "shelf"
-    panel.avoid.value = NOTHING
-    assert asked(studio)[0].constraints.avoid is None
+    assert found.pregrasp_clearance == pytest.approx(0.008)
+    assert found.obstacles is not None
+    assert found.obstacles.name == "shelf"
+    panel.obstacles.value = NOTHING
+    assert asked(studio)[0].constraints.obstacles is None
 
 
 @pytest.mark.parametrize(("field", "text", "message"), [
