@@ -26,7 +26,7 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 		--output out/lift.parquet --video out/lift.webp
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow

@@ -36,7 +36,8 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio) -> None:
     upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
     studio._take(upload, "scene", studio.panel.obstacles, studio._draw_constraints)
     studio._draw_constraints()
-    drawn = [name for name in ("table", "contact_region0", "contact_region1", "contact_region2", "keep_out0", "keep_out1", "obstacles")
+    parts = "table", "contact_region0", "contact_region1", "contact_region2", "keep_out0", "keep_out1", "obstacles"
+    drawn = [name for name in parts
              if studio.client.scene.get_handle_by_name(f"/constraints/{name}") is not None]
     assert drawn == ["table", "contact_region0", "contact_region1", "keep_out0", "obstacles"]
     found = asked(studio)[0].constraints
