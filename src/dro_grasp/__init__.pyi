@@ -3,11 +3,7 @@
 from ._version import __version__ as __version__
 from .apps.server.client import GraspClient as GraspClient
 from .apps.viewer.grasp_page import view_grasps as view_grasps
-from .arm.motion import (
-    MotionPlan as MotionPlan,
-    trajectory_csv as trajectory_csv,
-    trajectory_yaml as trajectory_yaml,
-)
+from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
 from .arm.planner import PlanConfig as PlanConfig, plan as plan
 from .arm.reachability import ReachConfig as ReachConfig
 from .arm.robot import Robot as Robot, load_robot as load_robot

@@ -38,10 +38,8 @@ class LinkPoses:
     """Pose of each link in the frame of the object points; the identity where not valid."""
     residual: Float[Tensor, "*b n_links"]
     """Root mean square distance of a link's points from its posed surface [m]; 0 where not valid."""
-    valid: Bool[Tensor, " n_links"]
-    """Links with enough points for a pose."""
-    points: Float[Tensor, "*b n_hand 3"]
-    """The multilaterated hand cloud [m]."""
+    valid: Bool[Tensor, " n_links"]  # links with enough points for a pose
+    points: Float[Tensor, "*b n_hand 3"]  # the multilaterated hand cloud [m]
 
     def to(self, device: torch.device | str) -> LinkPoses:
         """The same poses on another device."""
@@ -53,12 +51,9 @@ class _Segments:
     """The points of each registrable link, padded to one length."""
 
     links: Int[Tensor, " l"]
-    index: Int[Tensor, "l p"]
-    """Rows of the hand cloud; 0 where padded."""
-    weight: Float[Tensor, "l p"]
-    """1, or 0 where padded."""
-    local: Float[Tensor, "l p 3"]
-    """The points in their link's frame [m]."""
+    index: Int[Tensor, "l p"]  # rows of the hand cloud; 0 where padded
+    weight: Float[Tensor, "l p"]  # 1, or 0 where padded
+    local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
 
 
 def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:

@@ -36,8 +36,7 @@ class NamedMotion(NamedTuple):
     """A pose in a named frame."""
 
     frame: str
-    T: Float[Tensor, "4 4"]
-    """Takes coordinates to those of the frame [m]."""
+    T: Float[Tensor, "4 4"]  # takes coordinates to those of the frame [m]
 
 
 def read_motion(path: Path, key: str) -> NamedMotion:

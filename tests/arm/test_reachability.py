@@ -11,15 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
-from dro_grasp.arm.reachability import (
-    STEEPEST,
-    TURNED,
-    Fault,
-    Reachability,
-    ReachConfig,
-    WristSolver,
-    reachable_directions,
-)
+from dro_grasp.arm.reachability import STEEPEST, TURNED, Fault, Reachability, ReachConfig, WristSolver, reachable_directions
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.workcell import Workcell
 from tests.helpers.claw_urdf import PALM, joint, link

@@ -11,14 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
 from dro_grasp.compare.methods import mean_grasps_of
-from dro_grasp.compare.metrics import (
-    difference_interval,
-    diversity,
-    finger_contact,
-    mean_share,
-    roc_area,
-    wilson_interval,
-)
+from dro_grasp.compare.metrics import difference_interval, diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores

@@ -11,17 +11,7 @@ from dro_grasp.cli.benchmark import cells
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.compare.rows import Row, average
-from dro_grasp.compare.stages import (
-    BEST,
-    EQUAL_TIME,
-    RANKED,
-    RAW,
-    REFINED,
-    RETURNED,
-    STAGES,
-    BenchmarkConfig,
-    benchmark,
-)
+from dro_grasp.compare.stages import BEST, EQUAL_TIME, RANKED, RAW, REFINED, RETURNED, STAGES, BenchmarkConfig, benchmark
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object

@@ -23,12 +23,7 @@ from lab.methods.gendexgrasp import contact_maps, map_method
 from lab.methods.gendexgrasp.contact_maps import contact_map, sharpened
 from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit, map_energy
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
-from lab.methods.gendexgrasp.map_training import (
-    MapTrainingConfig,
-    draw_maps,
-    map_losses,
-    train_contact_maps,
-)
+from lab.methods.gendexgrasp.map_training import MapTrainingConfig, draw_maps, map_losses, train_contact_maps
 from tests.helpers.toy_hand import toy_hand
 
 SMALL = MapTrainingConfig(ScheduleConfig(steps=6, recalibration=2, log_every=1), batch=4, points=32, hand_points=24)

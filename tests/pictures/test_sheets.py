@@ -23,14 +23,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures import sheets as pictures
-from dro_grasp.pictures.appearance import (
-    OBJECT_COLOUR,
-    best_camera,
-    hand_meshes,
-    link_colours,
-    object_meshes,
-    success_colour,
-)
+from dro_grasp.pictures.appearance import OBJECT_COLOUR, best_camera, hand_meshes, link_colours, object_meshes, success_colour
 from dro_grasp.pictures.sheets import (
     CAPTION,
     CONTACT_DISTANCE,

@@ -165,11 +165,7 @@ class Constraints(Checked):
 
 
 def _vector(given: Any) -> Direction:
-    """A direction as plain numbers, from any kind of vector.
-
-    Raises:
-        OptionError: It is none of three numbers.
-    """
+    """A direction as plain numbers, from any kind of vector."""
     try:
         x, y, z = _numbers(given)
     except (TypeError, ValueError, RuntimeError, OptionError) as error:  # PyTorch raises the third
@@ -179,11 +175,7 @@ def _vector(given: Any) -> Direction:
 
 
 def _balls(name: str, given: Any) -> tuple[Ball, ...]:
-    """Balls as plain numbers, from any kind of rows.
-
-    Raises:
-        OptionError: One has no four numbers, or no radius; or there are too many.
-    """
+    """Balls as plain numbers, from any kind of rows."""
     example = f"x, y, z and a radius above 0 in metres, for example --{name.replace('_', '-')} 0 0 0.1 0.03"
     try:
         rows = [_numbers(ball) for ball in given]

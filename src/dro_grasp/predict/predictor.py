@@ -112,17 +112,8 @@ class GraspPredictor:
             num: Grasps to return.
             seed: The same seed gives the same grasps.
             constraints: What grasps have to respect; the fields of `Constraints` that are given by name replace its own.
-            direction: See `Constraints`, as `max_tilt` and all up to `pregrasp_clearance`.
-            max_tilt: Likewise.
-            table: Likewise.
-            obstacles: Likewise.
-            contact_region: Likewise.
-            keep_out: Likewise.
-            pregrasp_clearance: Likewise.
-            candidates: See `GraspRequest`, as `refine`, `temperature` and `source`.
-            refine: Likewise.
-            temperature: Likewise.
-            source: Likewise.
+            direction: Field of `Constraints`, as all up to `pregrasp_clearance`.
+            candidates: Field of `GraspRequest`, as `refine`, `temperature` and `source`.
 
         Raises:
             ObjectError: The obstacles contain the object.

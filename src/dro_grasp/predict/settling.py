@@ -57,12 +57,9 @@ class SettleConfig(Checked):
 class Settled(NamedTuple):
     """What became of n grasps, m of which hold still."""
 
-    grasps: GraspBatch
-    """All of them, in their order."""
-    stable: Bool[Tensor, " n"]
-    """Which ones hold still, with no link too deep in the object or in another."""
-    state: GraspState
-    """How these m hold the object."""
+    grasps: GraspBatch  # all of them, in their order
+    stable: Bool[Tensor, " n"]  # which ones hold still, with no link too deep in the object or in another
+    state: GraspState  # how these m hold the object
 
 
 def can_settle(problem: GraspProblem) -> bool:

@@ -12,15 +12,7 @@ from dataclasses import MISSING, fields
 from itertools import pairwise
 from typing import Any, Literal, TypeVar, get_type_hints
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    create_model,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, create_model, field_validator, model_validator
 
 from dro_grasp.kinds import FORMER_CONSTRAINTS, FORMER_SOURCES
 from dro_grasp.predict.config import GraspRequest

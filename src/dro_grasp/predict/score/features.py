@@ -27,33 +27,23 @@ FARTHEST = 0.05  # Links farther away than this look alike [m] (ours)
 
 
 @dataclass(frozen=True)
-class GraspState:
+class LinkMeasures:
     """n grasps of an object; each of the l links that have surface points stands at its point nearest to the object.
 
     Vectors are in the object's frame; `palm_axes` turns them into the palm's, in which all hands look alike.
     """
 
-    gap: Float[Tensor, "n l"]
-    """Signed distance to the object [m]."""
-    object_normal: Float[Tensor, "n l 3"]
-    """Outward, as that of the link."""
+    gap: Float[Tensor, "n l"]  # signed distance to the object [m]
+    object_normal: Float[Tensor, "n l 3"]  # outward, as that of the link
     link_normal: Float[Tensor, "n l 3"]
-    position: Float[Tensor, "n l 3"]
-    """Position relative to the object's centre [m]."""
-    arriving: Float[Tensor, "n l 3"]
-    """Motion from the pregrasp to the grasp [m]."""
-    closing: Float[Tensor, "n l 3"]
-    """Motion from the grasp to the squeeze [m]."""
-    is_palm: Float[Tensor, "n l"]
-    """1 for the palm, 0 for other links."""
-    palm_axes: Float[Tensor, "n 3 3"]
-    """Axes of the palm as columns."""
-    terms: Float[Tensor, "n terms"]
-    """Weighted terms of the grasp energy."""
-    size: Float[Tensor, " n"]
-    """Typical distance of the object's surface from its centre [m]."""
-    offset: Float[Tensor, " n"]
-    """Distance of the grasp centre from the object's centre [m]."""
+    position: Float[Tensor, "n l 3"]  # position relative to the object's centre [m]
+    arriving: Float[Tensor, "n l 3"]  # motion from the pregrasp to the grasp [m]
+    closing: Float[Tensor, "n l 3"]  # motion from the grasp to the squeeze [m]
+    is_palm: Float[Tensor, "n l"]  # 1 for the palm, 0 for other links
+    palm_axes: Float[Tensor, "n 3 3"]  # axes of the palm as columns
+    terms: Float[Tensor, "n terms"]  # weighted terms of the grasp energy
+    size: Float[Tensor, " n"]  # typical distance of the object's surface from its centre [m]
+    offset: Float[Tensor, " n"]  # distance of the grasp centre from the object's centre [m]
 
     @property
     def nearness(self) -> Float[Tensor, "n l"]:
@@ -68,9 +58,8 @@ class GraspState:
 class Feature(NamedTuple):
     """One or several numbers for the network."""
 
-    width: int
-    """How many numbers."""
-    of: Callable[[GraspState], Float[Tensor, "n *rest"]]
+    width: int  # how many numbers
+    of: Callable[[LinkMeasures], Float[Tensor, "n *rest"]]
     """Computes them: (n l) or (n l width) for each link, (n) or (n width) for the whole grasp."""
 
 
@@ -118,7 +107,7 @@ def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor,
     return GraspFeatures(table(LINK_FEATURES, *state.gap.shape), state.nearness, table(GRASP_FEATURES, len(state.gap)))
 
 
-def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspState:
+def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> LinkMeasures:
     """Grasps as their features see them; arguments as for `grasp_features`."""
     hand, device = energy.hand, energy.centre.device
     grasps = complete(energy.source, grasps, energy.centre.cpu())
@@ -127,7 +116,7 @@ def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n
     near = NearestPoints.of(energy, T, q)
     before, after = (near.pick(hand.points(joints, T)) for joints in (pregrasp, squeeze))
     offset = (hand.grasp_centres(T) - energy.centre).norm(dim=-1)
-    return GraspState(
+    return LinkMeasures(
         gap=near.gap, object_normal=near.object_normals, link_normal=near.link_normals, position=near.points - energy.centre,
         arriving=near.points - before, closing=after - near.points,
         is_palm=(near.links == hand.palm).to(near.gap).expand_as(near.gap), palm_axes=T[:, :3, :3] @ hand.palm_axes_wrist,

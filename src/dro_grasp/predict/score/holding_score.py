@@ -26,8 +26,7 @@ LEAST_MOTION = 1e-4  # Motions below this look alike [m, rad, m/s, rad/s] (ours)
 class HoldingScore(nn.Module):
     """A small network on a dozen numbers of each grasp."""
 
-    mean: Float[Tensor, " features"]
-    """Of each number over the training grasps, as their `deviation`."""
+    mean: Float[Tensor, " features"]  # of each number over the training grasps, as their `deviation`
     deviation: Float[Tensor, " features"]
 
     def __init__(self, trials: int, width: int) -> None:

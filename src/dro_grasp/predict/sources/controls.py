@@ -25,10 +25,8 @@ CHOICE_POINTS = 160  # Hand points by which a rotation of the mean grasp is chos
 class MeanGrasp:
     """The mean over training grasps of a hand, in the wrist frame."""
 
-    joints: Float[Tensor, " n_dof"]
-    """[rad or m]"""
-    object_centre: Float[Tensor, "3"]
-    """Position of the object's centre in the wrist frame [m]."""
+    joints: Float[Tensor, " n_dof"]  # [rad or m]
+    object_centre: Float[Tensor, "3"]  # position of the object's centre in the wrist frame [m]
 
 
 class StartSource(Source):

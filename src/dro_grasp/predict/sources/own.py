@@ -82,11 +82,7 @@ class FileSource(Source):
         return min(num, self._stored(obj).out_of)
 
     def _stored(self, obj: ObjectModel) -> GraspBatch:
-        """The stored grasps of an object.
-
-        Raises:
-            GraspFileError: There is none.
-        """
+        """The stored grasps of an object."""
         parts = [part for _, part in self.grasps.by_object() if part.object[0] == obj.name]
         if not parts:
             held = ", ".join(sorted(set(self.grasps.object))[:5])

@@ -94,11 +94,7 @@ def _as_source(name: str, made: Any) -> Source:
 
 
 def _own_class(module: str, attribute: str) -> Callable[[], Any]:
-    """A class by its module and name; modules in the working directory are found too.
-
-    Raises:
-        OptionError: It cannot be imported.
-    """
+    """A class by its module and name; modules in the working directory are found too."""
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:
