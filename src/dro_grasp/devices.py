@@ -1,10 +1,11 @@
-"""Devices and cores of this machine: which there are, and how work and records are spread over them."""
+"""Devices and cores of this machine: which there are, how work and records are spread over them, and what time it takes."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -147,3 +148,20 @@ class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like th
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         with torch.inference_mode(False):
             return super().__get__(instance, owner)
+
+
+class Stopwatch:
+    """Adds up the time spent in named blocks."""
+
+    def __init__(self, *names: str) -> None:
+        """Start the named parts at zero; others appear when they run."""
+        self.seconds: dict[str, float] = dict.fromkeys(names, 0.0)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Count the block towards a part; CUDA, if it is in use, is waited for before the clock is read."""
+        begin = time.perf_counter()
+        yield
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -19,7 +20,6 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig, OptimiserSource
 from dro_grasp.predict.stages import complete, ease, evaluate, rank, refine, scored
-from dro_grasp.predict.stopwatch import Stopwatch
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 

@@ -23,7 +23,7 @@ from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, 
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.trajectory import find_path, timed_stages
 from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
-from dro_grasp.devices import side_by_side
+from dro_grasp.devices import Stopwatch, side_by_side
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
@@ -38,7 +38,6 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
-from dro_grasp.predict.stopwatch import Stopwatch
 
 Directions = Literal["paper", "all"]  # Palm directions that are asked for
 PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 
@@ -21,21 +20,6 @@ from dro_grasp.predict.sources.registry import WITH_DATA, make_source
 from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
 
-@runtime_checkable
-class TrainingGrasps(Protocol):
-    """What the mean grasps need of a training bundle, which this wing does not know."""
-
-    @property
-    def objects(self) -> Mapping[str, Any]:
-        """Cloud of each object, with its `points` [m]."""
-        ...
-
-    @property
-    def grasps(self) -> Mapping[str, Any]:
-        """Grasps of each hand: `joints`, `T_object_wrist` and `object_index`."""
-        ...
-
-
 @dataclass(frozen=True)
 class MethodOptions(Checked):
     """What methods are made with."""
@@ -46,8 +30,8 @@ class MethodOptions(Checked):
     """Where networks run."""
     temperature: float | None = None
     """Spread of z of the D(R,O) network."""
-    bundle: TrainingGrasps | None = None
-    """Training grasps, for the mean grasp."""
+    bundle: Any = None  # its class is of training, a wing above this one
+    """A `Bundle` of training grasps, for the mean grasp."""
     candidates: int = GraspRequest.candidates
     """Candidates for each grasp that a method returns."""
 
@@ -129,7 +113,7 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     return Method(source, predictor, label, options.candidates)
 
 
-def mean_grasps_of(bundle: TrainingGrasps) -> dict[str, MeanGrasp]:
+def mean_grasps_of(bundle: Any) -> dict[str, MeanGrasp]:
     """The mean grasp of each hand in a training bundle that has grasps."""
     clouds = torch.stack([cloud.points.mean(0) for cloud in bundle.objects.values()])
     means = {}

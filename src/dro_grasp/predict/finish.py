@@ -12,6 +12,7 @@ from functools import cached_property
 from jaxtyping import Int
 from torch import Tensor
 
+from dro_grasp.devices import Stopwatch
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import EasingConfig
@@ -22,7 +23,6 @@ from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
-from dro_grasp.predict.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.devices import one_thread, side_by_side
+from dro_grasp.devices import Stopwatch, one_thread, side_by_side
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
@@ -29,7 +29,6 @@ from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, approach_cost, wri
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.source import Candidates, Progress, Source
-from dro_grasp.predict.stopwatch import Stopwatch
 
 HIGHEST_TEMPERATURE = 2.0  # Highest temperature that is accepted; 1 is what the weights were trained for (ours)
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import Stopwatch
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], None]  # Called with (candidates made so far, candidates wanted)
 AUTO = "auto"  # The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust
@@ -112,10 +112,7 @@ def ask(
 
     Args:
         source: What proposes.
-        problem: See `Source.propose`.
-        num: Likewise.
-        seed: Likewise.
-        progress: Likewise.
+        problem: See `Source.propose`, as `num`, `seed` and `progress`.
         n_points: Hand points to keep where the source states none.
     """
     watch = Stopwatch()
