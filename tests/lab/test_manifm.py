@@ -113,8 +113,8 @@ def test_training_makes_a_method_that_the_benchmark_takes(
     train.train("manifm", home / "bundle.safetensors", tmp_path / "run", weights, steps=2)
     assert weights.stat().st_size < 3_000_000
     assert make_method("lab.methods.manifm:ContactMethod").name == "manifm"
-    method = ContactMethod(weights)
-    grasps = method.predict(HAND, load_object("sphere"), 2, 3)
+    method, problem = ContactMethod(weights), GraspProblem(HAND, load_object("sphere"))
+    grasps = method.propose(problem, 2, 3)
     assert len(grasps) == 2
     assert bool(grasps.states_closing.all())
-    assert torch.equal(grasps.joints, method.predict(HAND, load_object("sphere"), 2, 3).joints)
+    assert torch.equal(grasps.joints, method.propose(problem, 2, 3).joints)
