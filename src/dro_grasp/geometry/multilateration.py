@@ -1,7 +1,4 @@
-"""Positions from distances to known points.
-
-Source: paper section III-D, robotic grasp pose point cloud generation.
-"""
+"""Positions from distances to known points. Source: paper section III-D, robotic grasp pose point cloud generation."""
 
 from __future__ import annotations
 
