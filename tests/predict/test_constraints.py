@@ -15,6 +15,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.optimize.starts import LARGEST_TILT, angle_to_arc
 from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
@@ -126,3 +127,16 @@ def test_balls_that_are_none_are_refused(name: str, balls: object) -> None:
     option = "--" + name.replace("_", "-")
     with pytest.raises(OptionError, match=f"{name} .*; give .*x, y, z and a radius above 0 in metres, .*{option} 0 0 0.1"):
         given(**{name: balls})
+
+
+def test_every_field_moves_with_the_frame_or_is_the_same_in_all_of_them() -> None:
+    """A field that is left out of `moved` would be judged in the wrong frame by `plan`."""
+    everything = Constraints(
+        direction=(1.0, 0.0, -1.0), table=-0.1, max_tilt=0.5, obstacles=load_scene(np.full((40, 3), 0.7)),
+        contact_region=((0.0, 0.0, 0.0, 0.1),), keep_out=((0.1, 0.0, 0.0, 0.02),), pregrasp_clearance=0.01)
+    assert all(getattr(everything, f.name) not in (None, ()) for f in dataclasses.fields(Constraints)), "each field is tried"
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[0.0, -1.0], [1.0, 0.0]], (0.1, 0.2, 0.3)
+    moved = everything.moved(T)
+    same = {f.name for f in dataclasses.fields(Constraints) if getattr(moved, f.name) == getattr(everything, f.name)}
+    assert same == {"max_tilt", "pregrasp_clearance"}
