@@ -26,7 +26,7 @@ from dro_grasp.network.checkpoints import load_weights, save_weights
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding_score import SHIPPED, HoldingScore, holding_features
+from dro_grasp.predict.score.score import SHIPPED_HOLDING, HoldingScore, holding_features
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
@@ -135,7 +135,7 @@ def main() -> None:
         "stage": "ranking of settled grasps", "script": Path(__file__).name, "trials": TRIALS, "seed": options.seed, **found,
         "data": {"hands": dict(Counter(part["hand"] for part in parts for _ in part["score"])), "grasps": grasps},
     }
-    save_weights(fit(parts, options.seed), SHIPPED, about)
+    save_weights(fit(parts, options.seed), SHIPPED_HOLDING, about)
 
 
 if __name__ == "__main__":

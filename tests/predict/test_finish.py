@@ -18,7 +18,7 @@ from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violation
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, finish
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding_score import holding_score
+from dro_grasp.predict.score.score import holding_score
 from dro_grasp.predict.settling import SettleConfig, settle_grasps
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Candidates

@@ -21,8 +21,7 @@ from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding_score import holding_score
-from dro_grasp.predict.score.score import ScoreConfig
+from dro_grasp.predict.score.score import ScoreConfig, holding_score
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import GraspState, grasp_state

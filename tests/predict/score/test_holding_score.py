@@ -13,7 +13,7 @@ from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import synthesize
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding_score import FEATURES, SHIPPED, holding_features, holding_score, load_holding_score
+from dro_grasp.predict.score.score import HOLDING_FEATURES, SHIPPED_HOLDING, holding_features, holding_score, load_holding_score
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.grasp_state import GraspState
@@ -42,14 +42,14 @@ def test_what_holds_less_scores_less(worse: dict[str, float]) -> None:
 def test_the_ranking_networks_score_counts() -> None:
     low, high = (float(holding_score(torch.tensor([s]), held())) for s in (-2.0, 2.0))
     assert low < high - 0.5
-    assert holding_features(torch.tensor([1.0]), held()).shape == (1, FEATURES)
+    assert holding_features(torch.tensor([1.0]), held()).shape == (1, HOLDING_FEATURES)
 
 
 @pytest.mark.parametrize("content", ["missing", "cut short", "another network"])
 def test_a_file_that_holds_no_such_score_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "score.safetensors"
     if content == "cut short":
-        path.write_bytes(SHIPPED.read_bytes()[:200])
+        path.write_bytes(SHIPPED_HOLDING.read_bytes()[:200])
     elif content == "another network":
         save_weights(torch.nn.Linear(2, 1), path)
     with pytest.raises(WeightsError, match=r"score.safetensors cannot be read"):
@@ -57,7 +57,7 @@ def test_a_file_that_holds_no_such_score_is_refused(tmp_path: Path, content: str
 
 
 def test_a_file_with_a_number_that_is_none_is_refused(tmp_path: Path) -> None:
-    broken = load_holding_score(SHIPPED)
+    broken = load_holding_score(SHIPPED_HOLDING)
     with torch.no_grad():
         broken.layers[0].bias[0] = torch.nan
     save_weights(broken, tmp_path / "score.safetensors")
