@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dro_grasp.arm.planner import grasps_in_world, paper_directions
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.admission import AdmissionConfig
@@ -56,13 +56,13 @@ def test_a_request_for_fewer_grasps_than_directions_asks_for_some_of_them(tmp_pa
     torch.testing.assert_close(few, torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), atol=1e-6, rtol=0)
 
 
-def test_where_nothing_is_found_there_is_an_empty_batch(tmp_path: Path) -> None:
+def test_where_nothing_is_found_it_says_why(tmp_path: Path) -> None:
     nowhere = PredictorConfig(
         finish=FinishConfig(settle=None, admission=AdmissionConfig(least_clearance=9.0)), rescue=RescueConfig(
             trusted_in_surroundings=()))
     asked = GraspPredictor(str(untrained_weights(tmp_path)), config=nowhere)
     for directions in ("all", torch.eye(3)[:2]):
-        found = grasps_in_world(asked, HAND, CAN, T, GraspRequest(2, 1, 1), Constraints(table=0.0), directions)
-        assert (len(found), found.hand) == (0, "gripper3")
+        with pytest.raises(NoGraspError, match=r"only 0 of \d+ candidates on object 'can' .* lower table"):
+            grasps_in_world(asked, HAND, CAN, T, GraspRequest(2, 1, 1), Constraints(table=0.0), directions)
     with pytest.raises(OptionError, match="leaves nothing of the object"):
         grasps_in_world(asked, HAND, CAN, T, GraspRequest(2, 1, 1), Constraints(table=2.0))

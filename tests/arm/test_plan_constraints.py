@@ -131,3 +131,10 @@ def test_what_says_nothing_or_says_it_twice_is_refused(
         plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(contact_region=((0.0, 0.0, 0.0, 0.05),))))
     with pytest.raises(OptionError, match="objects of attempts come to rest anywhere"):
         TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(keep_out=((0.0, 0.0, 0.0, 0.05),))))
+
+
+def test_where_no_grasp_respects_the_constraints_the_plan_says_so(robot, standing) -> None:
+    """Not that the object is out of reach, or that nothing was dropped."""
+    wanted = dro.PlanConfig(num=2, batches=1, rehearsals=0, constraints=dro.Constraints(pregrasp_clearance=0.19))
+    with pytest.raises(dro.DroGraspError, match=r"only 0 of \d+ candidates .* too close in pregrasp.* less pregrasp_clearance"):
+        plan(robot, *standing, config=wanted)

@@ -143,8 +143,9 @@ def plan(
                 break
             if (made := motion(task, tries, goals, seed + attempt)) is not None:
                 return made
-    raise PlanError(f"{grasps_and_dropped(len(tries.grasps), tries.counts)}, and none is left for '{obj.name}'; "
-                    f"{task.advice(tries.counts)}")
+    raise PlanError(tries.shortage if tries.shortage and not len(tries.grasps) else (
+        f"{grasps_and_dropped(len(tries.grasps), tries.counts)}, and none is left for '{obj.name}'; "
+        f"{task.advice(tries.counts)}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +233,7 @@ class Tries:
     share: dict[int, float] = field(default_factory=dict)  # Share of the rehearsals in which a grasp holds the object
     lost: list[Feasible] = field(default_factory=list)  # Can be carried out, but lose the object when rehearsed
     dropped: dict[int, str] = field(default_factory=dict)  # Why
+    shortage: str = ""  # Why a batch had no grasp at all
     watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
 
     @property
@@ -255,7 +257,10 @@ def candidates(
     make = given or _predicted(task, predictor or GraspPredictor())
     for batch in range(task.config.batches):
         with tries.watch("grasps"):
-            made = make(task.seed + 7919 * batch)  # far from the seeds of other plans
+            try:
+                made = make(task.seed + 7919 * batch)  # far from the seeds of other plans
+            except NoGraspError as error:  # another seed may find some
+                made, tries.shortage = GraspBatch.none(task.robot.hand, task.obj), str(error)
         yield made, batch + 1 == task.config.batches
 
 
@@ -406,7 +411,8 @@ def grasps_in_world(
     """Grasps as the predictor returns them for the same request and constraints, the best first; their frame is the world's.
 
     The object's z axis points up, and constraints are in the world's frame. Where these want no palm direction, each of those
-    that are given, unit vectors in the world, gets a request of its own, with its share of the grasps.
+    that are given, unit vectors in the world, gets a request of its own, with its share of the grasps. NoGraspError if none of
+    them finds any.
     """
     T = torch.from_numpy(T_world_object).float()
     problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))
@@ -419,16 +425,16 @@ def grasps_in_world(
         shares = [request.num * (i + 1) // len(problems) - request.num * i // len(problems) for i in range(len(problems))]
         requests = [replace(request, num=num, seed=seed) for num, seed in zip(shares, seeds, strict=True)]
 
-    def made(problem: GraspProblem, request: GraspRequest) -> GraspBatch | None:
+    def made(problem: GraspProblem, request: GraspRequest) -> GraspBatch | NoGraspError:
         try:
             return predictor.run(problem, request).grasps
-        except NoGraspError:
-            return None
+        except NoGraspError as error:  # other directions may have some
+            return error
 
     # Alone, a request uses all threads itself.
     parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
-    found = [grasps for grasps in parts if grasps is not None]
+    found = [part for part in parts if isinstance(part, GraspBatch)]
     if not found:
-        return GraspBatch.none(hand, obj)
+        raise next(part for part in parts if isinstance(part, NoGraspError))
     ranked = GraspBatch.concatenate(found).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)

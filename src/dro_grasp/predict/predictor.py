@@ -222,7 +222,7 @@ class _Asking:
         """Candidates until as many as were asked for are admitted, as long as that is in sight."""
         wanted, retry = self.request.num * self.request.candidates, self.config.retry
         count, admitted = wanted, 0
-        for seed in _seeds(self.request.seed, retry.rounds):
+        for seed in (self.request.seed, *_drawn(self.request.seed, retry.rounds - 1)):
             done = self.ask(source, count, seed)
             admitted += len(done.refined)
             if admitted >= wanted or admitted <= retry.least_yield * done.made:
@@ -237,11 +237,6 @@ class _Asking:
             if not lacking:
                 return
             self.ask(source, each * lacking, seed)
-
-
-def _seeds(first: int, count: int) -> list[int]:
-    """Seeds of rounds: the request's own, then others."""
-    return [first, *_drawn(first, count - 1)]
 
 
 def _drawn(first: int, count: int) -> list[int]:
