@@ -19,6 +19,7 @@ from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.closing import fixed_jaw_of
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.description.loader import Description, named
+from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand_description
@@ -75,7 +76,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -104,6 +105,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
         "open_posture": {n: round(x, 3) for n, x, m in zip(joints, hand.open_ends.tolist(), movable, strict=True) if m},
         "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
+        "effort": {n: round(x, 3) for n, x, m in zip(joints, find_efforts(hand).limit.tolist(), movable, strict=True) if m},
         "contact_links": [names[i] for i in hand.contact_links],
         "points": hand.n_points,
         "size_m": [round(float(x), 3) for x in np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0)],

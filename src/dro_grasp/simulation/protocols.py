@@ -109,6 +109,8 @@ class Protocol(Checked):
     """[kg m^2]"""
     force_limit: float = 20.0
     """Largest servo torque [Nm]."""
+    effort: bool = False
+    """Whether a servo's torque ends at its joint's effort instead (see `find_efforts`)."""
     lever: float = 0.03
     """Lever arm of sliding joints [m]: they get the servo of a turning joint that acts at this distance."""
     perturbations: Perturbations = field(default_factory=Perturbations)
@@ -159,7 +161,13 @@ ROBUST = Perturbations(
 With 6 of 8, a grasp that holds in nine of ten trials fails 4 % of the time, and one that holds in every second trial passes
 14 % of the time. All 8 would fail 57 % of the former, 5 of 8 would pass 36 % of the latter.
 """
+CARRY = Protocol(
+    "carry", friction=0.5, torsional_friction=0.005, force=9.81, gradual=True, reset=True, max_rotation=math.radians(15),
+    max_penetration=STRICT.max_penetration, max_self_penetration=STRICT.max_self_penetration, noslip=2, effort=True,
+)
+"""What a robot asks for that lifts things: the object's own weight in any direction, with fingers as strong as they are (ours)."""
 PROTOCOLS = {
+    "carry": CARRY,
     "dro": Protocol("dro"),
     "strict": STRICT,
     "robust": replace(STRICT, name="robust", perturbations=ROBUST),

@@ -20,6 +20,7 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.description.compiling import collide
+from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.objects.shape import ObjectModel
@@ -72,7 +73,8 @@ def attach(scene: mujoco.MjSpec, part: mujoco.MjSpec, frame: mujoco.MjsFrame, pr
 
 
 def add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
-    """Position servos on the independent joints, all hands alike."""
+    """Position servos on the independent joints: all hands alike, or as strong as each is."""
+    efforts = dict(zip(hand.tree.joint_names, find_efforts(hand).limit.tolist(), strict=True)) if protocol.effort else {}
     # They are added to the scene, not to the hand, whose description may set defaults for actuators.
     for joint in scene.joints:
         if joint.name.removeprefix(PREFIX) not in hand.tree.joint_names:
@@ -81,7 +83,7 @@ def add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
         name = joint.name.removeprefix(PREFIX)
         actuator = scene.add_actuator(name=name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=protocol.stiffness / lever**2, kv=protocol.damping / lever**2)
-        limit = protocol.force_limit / lever
+        limit = efforts.get(name, protocol.force_limit / lever)
         actuator.forcelimited, actuator.forcerange = True, [-limit, limit]
 
 

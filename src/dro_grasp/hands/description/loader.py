@@ -110,6 +110,16 @@ class Description:
         return read_geometry(self.model, self.link_of_body)
 
     @cached_property
+    def efforts(self) -> Float[np.ndarray, " n_dof"]:
+        """Largest effort of each independent joint, as the file states it [Nm or N]; NaN where it states none."""
+        stated = np.full(self.tree.n_dof, np.nan)
+        for i, name in enumerate(self.tree.joint_names):
+            joint = self.model.joint(name).id
+            if self.model.jnt_actfrclimited[joint]:
+                stated[i] = np.abs(self.model.jnt_actfrcrange[joint]).max()
+        return stated
+
+    @cached_property
     def masses(self) -> Float[np.ndarray, " n_links"]:
         """Mass of each link [kg]."""
         masses = np.zeros(self.tree.n_links)

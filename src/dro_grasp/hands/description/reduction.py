@@ -36,6 +36,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     hand = _largest_tree(spec, path)
     named = _name_everything(spec)
     driven = driven_joints(spec)
+    _limit_joints_as_actuators(spec)
     _couple_tendons(spec, notes)
     for kind in (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.cameras, spec.lights, spec.tuples, spec.skins):
         for item in list(kind):
@@ -200,6 +201,31 @@ def driven_joints(spec: mujoco.MjSpec) -> set[str]:
         through_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
         driven.update(wrapped.get(actuator.target, ()) if through_tendon else (actuator.target,))
     return driven & {joint.name for joint in spec.joints}
+
+
+def _limit_joints_as_actuators(spec: mujoco.MjSpec) -> None:
+    """State, in place, the largest effort of each driven joint at the joint, where it outlives the actuators."""
+    tendons = {t.name: t for t in spec.tendons}
+    joints = {j.name: j for j in spec.joints}
+    for actuator in spec.actuators:
+        if not (force := _largest_force(actuator)):
+            continue
+        shares = {actuator.target: abs(float(actuator.gear[0]))}
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON and actuator.target in tendons:
+            shares = {w.target.name: abs(w.coef * actuator.gear[0]) for w in tendons[actuator.target].path
+                      if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None}
+        for name, share in shares.items():
+            if name in joints and share and joints[name].actfrclimited != mujoco.mjtLimited.mjLIMITED_TRUE:
+                joints[name].actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+                joints[name].actfrcrange = [-share * force, share * force]
+
+
+def _largest_force(actuator: mujoco.MjsActuator) -> float:
+    """Largest force that an actuator exerts [N or Nm]; 0 where it states none."""
+    if np.diff(actuator.forcerange)[0] > 0:
+        return float(np.abs(actuator.forcerange).max())
+    motor = actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and np.diff(actuator.ctrlrange)[0] > 0
+    return float(abs(actuator.gainprm[0]) * np.abs(actuator.ctrlrange).max()) if motor else 0.0
 
 
 def couple_closed_loops(spec: mujoco.MjSpec, driven: Collection[str], path: Path, notes: list[Note]) -> None:
