@@ -74,6 +74,11 @@ class GraspProblem:
         """The object as closing is simulated on it: balls stand for a bare cloud."""
         return solid_of(self.obj)
 
+    @property
+    def mass(self) -> float:
+        """The object's mass; of a bare cloud, of what it encloses [kg]."""
+        return self.solid.mass
+
     @cached_property
     def centre(self) -> Float[Tensor, "3"]:
         """The object's centre of mass, on the CPU [m]."""

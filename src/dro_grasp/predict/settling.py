@@ -24,7 +24,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig, holding_score
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import GraspState, grasp_state
+from dro_grasp.simulation.grasp_state import GraspState, WeightConfig, grasp_state
 from dro_grasp.simulation.trial import hand_shift, settle
 
 
@@ -49,6 +49,8 @@ class SettleConfig(Checked):
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    weight: WeightConfig = field(default_factory=WeightConfig)
+    """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
@@ -121,9 +123,12 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    state, depth = grasp_state(hand, obj, better), deepest_penetration(hand, obj, better)
+    (state, torques), depth = grasp_state(hand, obj, better, config=config.weight), deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
+    unit = hand.tree.joint_unit**2 / config.refinement.grip.stiffness
+    pressed = (better.squeeze_joints + torques * unit).clamp(hand.tree.lower, hand.tree.upper)
+    better = better.replace(squeeze_joints=pressed)
     return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
 
 

@@ -36,6 +36,8 @@ GRAVITY = 9.81  # [m/s^2]
 class ForceConfig(Checked):
     """How forces are computed (ours)."""
 
+    friction: float = 0.5
+    """Largest coefficient that is relied on."""
     edges: int = 8
     """Edges of the pyramid that stands for a friction cone."""
     gap: float = 5e-4
@@ -82,7 +84,7 @@ def _generators(
     links: Int[np.ndarray, " k"], centre: Float[np.ndarray, "3"], config: ForceConfig,
 ) -> Touch:
     tree, rules = scene.hand.tree, scene.protocol
-    edges = friction_cone(torch.from_numpy(inward), rules.friction, config.edges).numpy()
+    edges = friction_cone(torch.from_numpy(inward), min(rules.friction, config.friction), config.edges).numpy()
     twist = rules.torsional_friction * np.stack([inward, -inward], 1)
     force = np.concatenate([edges, np.repeat(inward[:, None], 2, 1)], 1)
     moment = np.cross((points - centre)[:, None], force)

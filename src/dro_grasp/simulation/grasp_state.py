@@ -10,18 +10,19 @@ from dataclasses import dataclass, fields
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import Rows
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, quiet, rollouts
-from dro_grasp.simulation.scene import scene_of
+from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
 PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
@@ -58,9 +59,15 @@ class ContactForces:
 
     normal: Float[np.ndarray, "k 3"]
     arm: Float[np.ndarray, "k 3"]  # from the object's centre of mass [m]
+    point: Float[np.ndarray, "k 3"]  # in the wrist frame [m]
+    link: Int[np.ndarray, " k"]  # the hand's link that each is on
     pressure: Float[np.ndarray, " k"]  # normal force [N]
     tangential: Float[np.ndarray, " k"]  # tangential force [N]
-    links: int  # number of links that they are on
+
+    @property
+    def links(self) -> int:
+        """Number of links that they are on."""
+        return len(np.unique(self.link))
 
     @property
     def slip(self) -> float:
@@ -70,17 +77,26 @@ class ContactForces:
 
 
 def grasp_state(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
-) -> GraspState:
-    """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`."""
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    config: WeightConfig | None = None, workers: int | None = None
+) -> tuple[GraspState, Float[Tensor, "n n_dof"]]:
+    """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`.
+
+    The second result are the torques that joints add so that the contacts hold the object's weight (see `weight_torques`).
+    """
     scene = scene_of(hand, obj, grasps, protocol)
     none = {f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(GraspState)}
-    parts = [GraspState(**none)]
-    parts += [_observed(rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
-    return GraspState(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(GraspState)})
+    parts, torques = [GraspState(**none)], [grasps.joints[:0]]
+    for _, rollout in rollouts(scene, hand, grasps, workers):
+        state, found = _observed(rollout)
+        parts.append(state)
+        joints = torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
+        torques.append(weight_torques(hand, found, joints, torch.from_numpy(rollout.mass).to(joints), config))
+    state = GraspState(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(GraspState)})
+    return state, torch.cat(torques)
 
 
-def _observed(rollout: Rollout) -> GraspState:
+def _observed(rollout: Rollout) -> tuple[GraspState, list[ContactForces]]:
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
@@ -94,7 +110,8 @@ def _observed(rollout: Rollout) -> GraspState:
     }
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
-    return GraspState(**values, unanswered=unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction))
+    missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction)
+    return GraspState(**values, unanswered=missing), found
 
 
 def _contacts(rollout: Rollout) -> list[ContactForces]:
@@ -103,7 +120,7 @@ def _contacts(rollout: Rollout) -> list[ContactForces]:
     model, data = scene.model, mujoco.MjData(scene.model)
     names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
     state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in names}
-    found = []
+    found, links = [], link_of_body(scene)
     for i in range(rollout.size):
         for name in names:
             getattr(data, name)[:] = state[name][i]
@@ -119,8 +136,64 @@ def _contacts(rollout: Rollout) -> list[ContactForces]:
         touching = bodies[rows][bodies[rows] != scene.object_body]
         found.append(ContactForces(
             into * data.contact.frame.reshape(-1, 9)[rows, :3], data.contact.pos[rows] - data.xipos[scene.object_body],
-            forces[:, 0], np.linalg.norm(forces[:, 1:], axis=1), len(np.unique(touching))))
+            data.contact.pos[rows].copy(), links[touching], forces[:, 0], np.linalg.norm(forces[:, 1:], axis=1)))
     return found
+
+
+def link_of_body(scene: TrialScene) -> Int[np.ndarray, " n_bodies"]:
+    """The hand's link that each body of a scene is; -1 for those of no link."""
+    names = {name: i for i, name in enumerate(scene.hand.tree.link_names)}
+    return np.array([names.get(scene.model.body(b).name.removeprefix(PREFIX), -1) for b in range(scene.model.nbody)], int)
+
+
+@dataclass(frozen=True)
+class WeightConfig(Checked):
+    """How hard fingers press for the object's weight (ours)."""
+
+    margin: float = 2.0
+    """Multiple of the weight that is held whichever way gravity pulls; 0 squeezes light and heavy things alike."""
+    gravity: float = 9.81
+    """[m/s^2]"""
+    friction: float = 0.5
+    """Coefficient of friction that the forces rely on."""
+    contacts: int = 12
+    """Most contacts of a grasp that count, those that press hardest."""
+    edges: int = 6
+    """Edges of a friction cone."""
+    iterations: int = 100
+    """Steps of the solver."""
+
+
+def weight_torques(
+    hand: Hand, contacts: list[ContactForces], joints: Float[Tensor, "n n_dof"], mass: Float[Tensor, " n"],
+    config: WeightConfig | None = None,
+) -> Float[Tensor, "n n_dof"]:
+    """Torques by which joints press so that contacts hold the weight along each axis and against it [Nm or N].
+
+    For each way of gravity, the least forces within the friction cones that balance the weight; their mean balances itself,
+    and each contact presses in it for its share of whichever weight there is.
+    """
+    config, n = config or WeightConfig(), len(contacts)
+    if config.margin == 0 or n == 0:
+        return torch.zeros_like(joints)
+    k, tree = config.contacts, hand.tree
+    normal, arm, point = (joints.new_zeros(n, k, 3) for _ in range(3))
+    normal[..., 2], on, link = 1.0, joints.new_zeros(n, k), torch.zeros(n, k, dtype=torch.int64)
+    for i, c in enumerate(contacts):
+        kept = np.argsort(-c.pressure)[:k]
+        for table, values in ((normal, c.normal), (arm, c.arm), (point, c.point), (link, c.link)):
+            table[i, :len(kept)] = torch.as_tensor(values[kept]).to(table)
+        on[i, :len(kept)] = 1
+    cone = friction_cone(normal, config.friction, config.edges) * on[..., None, None]
+    wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1).flatten(1, 2).mT
+    pulls = torch.as_tensor(FORCES).to(joints)
+    goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).repeat(n, 1)
+    amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, RIDGE * 10, config.iterations)
+    mean = amounts.unflatten(0, (n, len(pulls))).mean(1).unflatten(1, (k, config.edges))
+    force = config.margin * config.gravity * mass[:, None, None] * (mean[..., None] * cone).sum(-2)
+    jacobian = torch.stack([
+        tree.point_jacobian(pose, p, at) for pose, p, at in zip(tree.forward(joints), point, link.clamp_min(0), strict=True)])
+    return torch.einsum("nkc,nkcd->nd", force, jacobian) * hand.movable
 
 
 def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:
