@@ -40,7 +40,7 @@ class Constraints(Checked):
     """
 
     direction: Direction | None = None
-    """Palm direction; any by default. Over a table, palms tilt towards it as far as the hand needs room."""
+    """Palm direction; any by default. Over a table, palms also tilt down as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
     max_tilt: float | None = None
