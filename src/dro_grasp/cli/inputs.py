@@ -32,9 +32,9 @@ class PalmOptions:
 
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
     """Palm direction: 0 0 -1 grasps from above. Over a table, palms also tilt down as far as the hand needs room."""
-    max_tilt: Annotated[float | None, optional("RAD", "no limit, palms point roughly along it")] = None
+    max_tilt: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
     """Largest angle [rad] between the palm direction and --direction. Palms are spread evenly within it."""
-    pregrasp_clearance: Annotated[float | None, optional("M", "joints open by a quarter of the range left")] = None
+    pregrasp_clearance: Annotated[float | None, optional("M", "a quarter of what is left")] = None
     """Least distance [m] between the object and every link that closes, in pregrasp."""
 
     def constraints(self, table: float | None = None, obstacles: Scene | None = None) -> Constraints:
