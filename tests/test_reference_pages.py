@@ -1,4 +1,4 @@
-"""The reference pages state what the code does: the numbers of protocols, and every error."""
+"""The reference pages state what the code does: the numbers of protocols and of the method, and every error."""
 
 from __future__ import annotations
 
@@ -9,12 +9,26 @@ from pathlib import Path
 import pytest
 
 from dro_grasp import errors
+from dro_grasp.geometry.multilateration import MultilaterationConfig
+from dro_grasp.grasps.controller_config import ControllerConfig
+from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig
 from dro_grasp.hands.library import load_hand
+from dro_grasp.network.latent import CERTAIN, FlowPrior, HandMotion
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.shape import DENSITY
+from dro_grasp.objects.perception.completion import CELLS, DEPTHS, GUESSES, SAMPLE, SPREAD, TURNS_AWAY
+from dro_grasp.objects.shape import BALL_OUTSIDE, BALL_SPACING, DENSITY
+from dro_grasp.optimize.fingers import ClosingConfig, EasingConfig
+from dro_grasp.optimize.grasp_energy import EnergyConfig
+from dro_grasp.optimize.squeeze import GripConfig
+from dro_grasp.predict.score.features import GRASP_FEATURES, LINK_FEATURES, NEAR
+from dro_grasp.predict.settling import SettleConfig
+from dro_grasp.predict.sources.choice import ChoiceConfig, ChoicePenalties
+from dro_grasp.simulation.grasp_state import CHANGE, LEVER, PUSH, UNIT
 from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import cached_scene
+from dro_grasp.training.config import LossConfig, MotionConfig
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -93,3 +107,63 @@ def test_the_page_of_errors_has_every_error() -> None:
     known = {name for name, value in classes.items() if issubclass(value, errors.DroGraspError)}
     stated = {row[0].strip("`") for row in table("errors.md", "| error ")[1:]}
     assert stated == known - {"DroGraspError"}
+
+
+def test_the_page_of_the_method_has_the_numbers_of_the_code() -> None:
+    page = " ".join((DOCS / "derivations.md").read_text().split())
+    choice, weights, closing = ChoiceConfig(), ChoicePenalties(), ClosingConfig()
+    grip, settle, easing, step = GripConfig(), SettleConfig(), EasingConfig(), JointSolverConfig()
+    mm = 1e3
+    for text in (
+        f"mixture of {NetworkConfig().placement_components} Gaussians",
+        f"`SCALE` = {HandMotion.SCALE:g} m",
+        f"log_variance near {CERTAIN:g}",
+        f"(`motion`, weight {LossConfig().motion:g})",
+        "a divergence weight of 1e-5" if MotionConfig().divergence == 1e-5 else "another weight",
+        f"`DRAWS` = {FlowPrior.DRAWS}",
+        f"`STEPS` = {FlowPrior.STEPS}",
+        f"{['', 'one', 'two'][choice.placements]} placements with {choice.draws} z each",
+        f"One of the {choice.placements * choice.draws} is",
+        f"{weights.finger_penetration / mm:g} mean_f ({weights.margin * mm:g} - d_f)+",
+        f"{weights.palm_penetration / mm:g} ({weights.margin * mm:g} - d_palm)+",
+        f"{weights.clearance / mm:g} ({weights.margin * mm:g} - d_around)+",
+        f"{weights.gap / mm:g} mean_f min(d_f+, {weights.reach * mm:g})",
+        f"{weights.crowding / mm:g} ({weights.apart * mm:g} - e)+ + {weights.imbalance:g} | N |",
+        f"exp(-d+ / {weights.nearness * mm:g})",
+        f"softplus^-1({NetworkConfig().initial_distance:g})",
+        f"standard deviation under {MultilaterationConfig().thin * mm:g} mm",
+        f"|w|, |dq| <= {step.step_limit:g}",
+        f"nearer to them than {EnergyConfig().clear * mm:g} mm",
+        f"q + {ControllerConfig().outer:g} (open - q) and q + {ControllerConfig().inner:g} (closed - q)",
+        f"more than {closing.idle * mm:g} mm from the object is idle",
+        f"posed at {closing.steps} values of s",
+        f"stops {closing.contact * mm:g} mm from the object",
+        f"goes {closing.rest_shares[1]:g} or {closing.rest_shares[2]:g} of the way",
+        f"nearer than {grip.reach * mm:g} mm to the object presses",
+        f"(n_in + {grip.friction:g} t_e)",
+        f"|A x|^2 + {grip.sharing:g} sum_k (s_k - 1/K)^2 + (sum_k s_k - 1)^2 + {grip.smoothness:g} |x|^2",
+        f"Scaled to {grip.force:g} N",
+        f"servos of {grip.stiffness:g} Nm/rad",
+        f"{grip.touching:g} of it for joints whose fingers all touch, {grip.idle:g} for others",
+        f"{sum(f.width for f in LINK_FEATURES.values())} numbers (`LINK_FEATURES`)",
+        f"has {sum(f.width for f in GRASP_FEATURES.values())} (`GRASP_FEATURES`)",
+        f"exp(-d+ / {NEAR * mm:g} mm)",
+        f"m < {settle.still * mm:g} mm",
+        f"{settle.still * mm:g} mm <= m < {settle.lost * 1e2:g} cm",
+        f"its score is at most {settle.unstable_score:g}",
+        f"by {settle.farthest * 1e2:g} cm or {math.degrees(settle.largest_turn):g} degrees",
+        f"is {settle.deepest * mm:g} mm deep",
+        f"each cube of {BALL_SPACING * mm:g} mm",
+        f"at most {BALL_OUTSIDE * mm:g} mm through the surface",
+        f"at least {easing.clearance * mm:g} mm and at most {easing.unseen * mm:g} mm",
+        f"falls by {settle.clearance_worth:g} log-odds per metre",
+        f"F = m {PUSH:g} m/s^2",
+        f"|sum f_k + F|^2 / (m {UNIT:g} m/s^2)^2",
+        f"(m {UNIT:g} m/s^2 {LEVER * 1e2:g} cm)^2 + {CHANGE:g}^2 sum (x_k - 1)^2",
+        f"`DEPTHS` = {DEPTHS[0]:g} ... {DEPTHS[-1]:g} widths",
+        f"for {SAMPLE} moved points",
+        f"f < {TURNS_AWAY:g}",
+        f"`GUESSES` = {GUESSES}",
+        f"grid of {CELLS:,} cells. {SPREAD:,} points",
+    ):
+        assert text in page, text
