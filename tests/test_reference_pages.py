@@ -1,15 +1,18 @@
-"""The reference pages state what the code does: the numbers of protocols and of the method, and every error."""
+"""The reference pages state what the code does: the numbers of protocols and of the method, every error and every column."""
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from dro_grasp import errors
+from dro_grasp.arm.tabletop import Attempt
 from dro_grasp.geometry.multilateration import MultilaterationConfig
+from dro_grasp.grasps.columns import CAMERA, COLUMNS, DEPTH, FRAME, FURTHER, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
 from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig
 from dro_grasp.hands.library import load_hand
@@ -24,6 +27,7 @@ from dro_grasp.optimize.squeeze import GripConfig
 from dro_grasp.predict.score.features import GRASP_FEATURES, LINK_FEATURES, NEAR
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.predict.sources.choice import ChoiceConfig, ChoicePenalties
+from dro_grasp.simulation.contacts import NAMES
 from dro_grasp.simulation.grasp_state import CHANGE, LEVER, PUSH, UNIT
 from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
@@ -167,3 +171,17 @@ def test_the_page_of_the_method_has_the_numbers_of_the_code() -> None:
         f"grid of {CELLS:,} cells. {SPREAD:,} points",
     ):
         assert text in page, text
+
+
+def stated_names(page: str) -> set[str]:
+    """All names in the first cells of a page's tables."""
+    rows = [line.split("|")[1] for line in (DOCS / page).read_text().splitlines() if line.startswith("|")]
+    return {name for cell in rows for name in re.findall(r"`([\w<>.]+)`", cell)}
+
+
+def test_the_page_of_formats_has_every_column() -> None:
+    stated = stated_names("file-formats.md")
+    grasps = {*COLUMNS, "wrist_position", "wrist_quaternion_wxyz", "success", *FURTHER, *NAMES, HAND_FILE, OBJECT_FILE,
+              OBJECT_SCALE, FRAME, CAMERA, DEPTH, RELABELLED}
+    assert grasps - {"T_object_wrist", "trial_success"} <= stated
+    assert {f.name for f in fields(Attempt)} <= stated
