@@ -12,7 +12,7 @@ import pytest
 from dro_grasp import errors
 from dro_grasp.arm.tabletop import Attempt
 from dro_grasp.geometry.multilateration import MultilaterationConfig
-from dro_grasp.grasps.columns import CAMERA, COLUMNS, DEPTH, FRAME, FURTHER, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, COLUMNS, DEPTH, FRAME, FURTHER, HAND_FILE, OBJECT_FILE, OBJECT_SCALE, RELABELLED
 from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig
 from dro_grasp.hands.library import load_hand
