@@ -180,7 +180,7 @@ def diversity(results: Results) -> str:
 
 def unseen(results: Results) -> str:
     """Hands that no weights were trained on, by source."""
-    rows = results.rows("unseen", ending="returned")
+    rows = [*results.rows("unseen", ending="returned"), *results.rows("unseen", ending="sources")]
     lines = []
     for name, text in (("auto", "returned by `generate`"), ("network", "by the network alone, finished"),
                        ("optimiser", "by the optimiser alone, finished")):
