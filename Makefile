@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow golden lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-slow results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -30,6 +30,16 @@ test: setup
 
 test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow
+
+NAMES :=
+results: setup  # measure what is missing or older than its code (NAMES="headline speed"; everything takes a night)
+	$(BIN)/python -m lab.runner $(NAMES)
+
+results-stale: setup  # what is missing or older than the code that it measures
+	$(BIN)/python -m lab.runner --stale $(NAMES)
+
+tables: setup  # write tables, numbers and figures of README and docs from lab/results
+	$(BIN)/python -m lab.tables
 
 golden: setup  # record anew what tests/golden compares, after a change that is meant to change results
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.golden.cases
