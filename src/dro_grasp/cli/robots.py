@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from dro_grasp.arm.tabletop import Attempt
 
 
+FLOATS = 0.1
+"""Height above the table from which on an object is said to float [m] (ours): of a bulge a camera sees no lower part."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """Plan the motion with which a robot grasps an object and lifts it. Needs the extra `[arm]`.
@@ -100,6 +104,10 @@ class Plan:
         if robot.table is None:
             say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
                       "`table` in the robot file")
+        lowest = float((obj.cloud @ T_world_object[2, :3]).min() + T_world_object[2, 3])
+        if robot.table is not None and lowest > robot.table.height + FLOATS:
+            say_aside(f"{obj.name} floats {lowest - robot.table.height:.2f} m above the table; if nothing holds it there, "
+                      "say where it is (--camera, --pose, --at)")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
