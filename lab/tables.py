@@ -87,9 +87,9 @@ def as_row(line: dict[str, Any]) -> Row:
 
 
 def _numbers(value: Any) -> Any:
-    """Nothing becomes NaN again."""
+    """Nothing becomes NaN again, and the label of a protocol its name."""
     if isinstance(value, dict):
-        return {key: _numbers(v) for key, v in value.items()}
+        return {key.partition("/")[0]: _numbers(v) for key, v in value.items()}
     if isinstance(value, list):
         return tuple(_numbers(v) for v in value)
     return math.nan if value is None else value
@@ -280,6 +280,57 @@ def commands(results: Results) -> str:
     return table(["command", "median [s]"], [[f"`{name}`", f"{seconds:.1f}"] for name, seconds in told.items()])
 
 
+def parts(results: Results) -> str:
+    """Parts beside what they replace, and rates of work."""
+    cell = {name: results.cell("speed", name) for name in ("inference", "joint_solver", "kernel", "trials", "synthesis")}
+    alone, many = cell["inference"]["latency_default"], cell["inference"]["batch16_per_grasp_default"]
+    return table(["part", "measured"], [
+        ["one grasp of one candidate, network to score [ms]", f"{1e3 * alone:.0f}"],
+        ["one of sixteen such grasps [ms]", f"{1e3 * many:.0f}"],
+        ["joint solver against CVXPY and Clarabel, one thread", f"{cell['joint_solver']['speedup']:.0f} times faster"],
+        ["kernel against the form that writes every pair, one thread", f"{cell['kernel']['speedup']:.0f} times faster, "
+         f"{100 * cell['kernel']['memory_ratio']:.0f} % of the memory"],
+        ["trials of `dro` a second, all cores", f"{cell['trials']['trials_per_second']:.0f}"],
+        ["synthesised grasps that pass `strict`, an hour of one core", f"{cell['synthesis']['strict_valid_per_cpu_hour']:,.0f}"],
+    ])
+
+
+def again(results: Results) -> str:
+    """Stored grasps that pass their protocol again."""
+    rows = results.cell("data", "again")["again"]
+    return table(["trial", "grasps", "held [%]"], [
+        [row["trial"], row["asked"], of(round(row["asked"] * row["success"] / 100), row["asked"])] for row in rows])
+
+
+def state(results: Results) -> str:
+    """Of which state and machine the headline is."""
+    results.cells("headline")
+    cells = list(results.used.values())
+    where, weights = cells[0]["machine"], cells[0]["weights"]
+    digest = next(v for k, v in weights.items() if "/" not in k)
+    return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} cores of an "
+            f"{where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, MuJoCo {where['mujoco']}.")
+
+
+def gpu(results: Results) -> str:
+    """What a GPU does, if one was at hand."""
+    found = results.cell("gpu", "device")
+    return f"{found['machine']['cuda']}: see `lab/results/gpu.json`."
+
+
+def training_told(results: Results) -> str:
+    """How long the paper's form was trained."""
+    (found,) = results.cell("fidelity", "trained")["pretrained"]
+    return f"trained for {found['seconds'] / 60:.0f} minutes of one core"
+
+
+def lifted(results: Results, robot: str) -> str:
+    """Share of attempts in which a robot held the object."""
+    tried = results.cell("lifts", f"{robot}, cloud")["attempts"]
+    held = success_rate(sum(a["success"] for a in tried), len(tried))
+    return f"{100 * held[0]:.0f} % [{100 * held[1]:.0f}-{100 * held[2]:.0f}]"
+
+
 def figure_data(results: Results) -> dict[str, dict[str, Sequence[float]]]:
     """Success and interval of each method under each protocol."""
     rows, stages = (results.rows("headline", "validate", ending) for ending in ("returned", "stages"))
@@ -333,9 +384,16 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "fidelity.form": fidelity,
     "data.card": data_card,
     "speed.commands": commands,
+    "speed.parts": parts,
+    "data.again": again,
 }
 """Tables by name."""
-VALUES: dict[str, Callable[[Results], str]] = {}
+VALUES: dict[str, Callable[[Results], str]] = {
+    "results.machine": state,
+    "gpu.told": gpu,
+    "fidelity.training": training_told,
+    **{f"lifts.{robot}": functools.partial(lifted, robot=robot) for robot in ROBOTS},
+}
 """Single numbers by name."""
 
 
