@@ -291,7 +291,7 @@ def parts(results: Results) -> str:
         ["kernel against the form that writes every pair, one thread", f"{cell['kernel']['speedup']:.0f} times faster, "
          f"{100 * cell['kernel']['memory_ratio']:.0f} % of the memory"],
         ["trials of `dro` a second, all cores", f"{cell['trials']['trials_per_second']:.0f}"],
-        ["synthesised grasps that pass `strict`, an hour of one core", f"{cell['synthesis']['strict_valid_per_cpu_hour']:,.0f}"],
+        ["synthesised grasps that pass `strict`, an hour of a core", f"{cell['synthesis']['strict_valid_per_cpu_hour']:,.0f}"],
     ])
 
 
@@ -308,8 +308,8 @@ def state(results: Results) -> str:
     cells = list(results.used.values())
     where, weights = cells[0]["machine"], cells[0]["weights"]
     digest = next(v for k, v in weights.items() if "/" not in k)
-    return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} cores of an "
-            f"{where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, MuJoCo {where['mujoco']}.")
+    return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} "
+            f"cores of an {where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, MuJoCo {where['mujoco']}.")
 
 
 def gpu(results: Results) -> str:
