@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | demo-arm | test | test-full | lint | wheels | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow golden lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-full golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -28,8 +28,8 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
-test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
-	$(BIN)/python -m pytest -q -m slow
+test-full: setup  # every test, with shape checks: also what is slow, starts a browser or Ray, or builds the wheel
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu'
 
 golden: setup  # record anew what tests/golden compares, after a change that is meant to change results
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.golden.cases
