@@ -29,7 +29,8 @@ test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 test-full: setup  # every test, with shape checks: also what is slow, starts a browser or Ray, or builds the wheel
-	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu'
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -q -m alone
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu and not alone'
 
 golden: setup  # record anew what tests/golden compares, after a change that is meant to change results
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.golden.cases

@@ -19,6 +19,13 @@ if os.environ.get("CHECK_SHAPES"):  # as `make test-full` sets it
     jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
 
 
+@pytest.fixture
+def as_users_have_it() -> None:
+    """Skips where the check of shapes comes first, and refuses by its own words."""
+    if os.environ.get("CHECK_SHAPES"):
+        pytest.skip("shapes are checked; make test runs it")
+
+
 @pytest.fixture(scope="session")
 def assets_folder() -> Path:
     folder = os.environ.get("DRO_GRASP_ASSETS")

@@ -6,6 +6,7 @@ import html
 import json
 import shlex
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +18,12 @@ from dro_grasp.errors import BundleError, OptionError, OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.network.checkpoints import describe_weights
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
-from dro_grasp.training import onboarding
+from dro_grasp.training import loop, onboarding
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.data.engine.shards import sole_run
 from dro_grasp.training.data.engine.worker import EngineConfig
 from dro_grasp.training.onboarding import Onboarded, OnboardingConfig, onboard, write_report
+from dro_grasp.training.runs import recalibrate
 from tests.helpers.weights import untrained_weights
 
 
@@ -39,6 +41,14 @@ def small(home: Path, **more: object) -> OnboardingConfig:
         0.01, ("sphere",), ("can",), 2, str(home / "untrained.safetensors"), 1, "network", grasps_drawn=3,
         engine=EngineConfig(candidates=32, min_candidates=32))
     return replace(given, **more)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_batches() -> Iterator[None]:
+    """The statistics of BatchNorm come from two batches; more take most of so short a training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "recalibrate", lambda model, forward, _: recalibrate(model, forward, 2))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +107,14 @@ def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
     assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / onboarding.DATA), "--output", "data.html"]
 
 
+@pytest.mark.usefixtures("made")
 def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path) -> None:
+    """Data and training know no source, so both are taken over from the run with another one."""
+    shutil.copytree(home / "out", home / "optimised")
+    state = json.loads((home / "out" / onboarding.STATE).read_text())
+    state["asked"]["source"] = "optimiser"
+    state["steps"] = {name: state["steps"][name] for name in ("check", "data", "training")}
+    (home / "optimised" / onboarding.STATE).write_text(json.dumps(state))
     done = onboard(str(home / "mine.urdf"), home / "optimised", small(home, source="optimiser"))
     assert [done.optimised(step) for step in ("before", "after")] == [1.0, 1.0]
     page = write_report(done).read_text()
