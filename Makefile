@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | demo-arm | test | test-full | results | results-stale | tables | lint | wheels | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -28,8 +28,9 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
-test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
-	$(BIN)/python -m pytest -q -m slow
+test-full: setup  # every test, with shape checks: also what is slow, starts a browser or Ray, or builds the wheel
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -q -m alone
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu and not alone'
 
 NAMES :=
 results: setup  # measure what is missing or older than its code (NAMES="headline speed"; everything takes a night)
