@@ -138,14 +138,14 @@ def test_the_first_lines_work_in_a_fresh_shell(tmp_path: Path) -> None:
     *quick, last = [line for line in lines if line.split()[0] not in installed]
     kept = {"HOME", "LANG", "TMPDIR", "PYTHONPATH", "DRO_GRASP_CACHE"}
     environment = {name: value for name, value in os.environ.items() if name in kept}
-    environment |= {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "PYTHONUNBUFFERED": "1"}
+    environment["PATH"] = f"{Path(sys.executable).parent}:/usr/bin:/bin"
     shell = {"cwd": tmp_path, "env": environment, "text": True}
     done = subprocess.run(["bash", "-eu", "-c", "\n".join(quick)], capture_output=True, timeout=600, **shell)
     assert done.returncode == 0, done.stderr
     assert "8 of 8 grasps succeeded" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"grasps.parquet", "grasps.png"}
-    with subprocess.Popen(["bash", "-eu", "-c", f"exec timeout 120 {last}"], stdout=subprocess.PIPE, **shell) as viewer:
-        assert any("viewer: http://127.0.0.1" in line for line in viewer.stdout)
+    with subprocess.Popen(["bash", "-eu", "-c", f"exec timeout 120 {last}"], stderr=subprocess.PIPE, **shell) as viewer:
+        assert any("viewer: http://127.0.0.1" in line for line in viewer.stderr)
         viewer.terminate()
 
 
