@@ -70,7 +70,7 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors
 
 docs-pictures: setup
-	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
+	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 8 --seed 0 --picture docs/pictures/grasps.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 --video docs/pictures/lift.webp
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
