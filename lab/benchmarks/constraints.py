@@ -1,6 +1,6 @@
 """What constraints cost: grasps returned, candidates dropped, time; and whether what is returned respects them.
 
-    python -m lab.benchmarks.constraints [--hand allegro] [--objects mug spray_bottle hammer] [--num 8] [--cases hold]
+    python -m lab.benchmarks.constraints [--hand allegro] [--objects mug spray_bottle hammer] [--num 8] [--cases contact_region]
         [--json]
 
 The last column looks at the vertices of the hand's collision shapes, which no stage of the prediction reads: how far the worst
@@ -143,12 +143,12 @@ def main() -> None:
             dropped += sum(prediction.dropped.values())
             if case.worst is not None:
                 worst.append(case.worst(hand, obj, prediction.grasps))
-        rows.append([name, f"{found} of {options.num * len(objects)}", 100 * dropped / made, float(np.median(times)),
-                     max(times), min(worst) if worst else "-"])
+        rows.append([name, options.num * len(objects), found, 100 * dropped / made, float(np.median(times)), max(times),
+                     min(worst) if worst else None])
         print(*rows[-1], file=sys.stderr, flush=True)
-    columns = ["constraint", "returned", "candidates dropped [%]", "processor time [s], median", "longest", "worst"]
+    columns = ["constraint", "asked", "returned", "candidates dropped [%]", "processor time [s], median", "longest", "worst"]
     emit(f"{options.num} grasps under constraints, {options.hand} on {', '.join(options.objects)}", rows, columns,
-         {str(row[0]): dict(zip(columns[1:], row[1:], strict=True)) for row in rows}, options.json)
+         {"rows": [dict(zip(columns, row, strict=True)) for row in rows]}, options.json)
 
 
 if __name__ == "__main__":

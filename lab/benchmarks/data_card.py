@@ -1,6 +1,6 @@
-"""The counts of docs/data-card.md, from the files themselves, as Markdown.
+"""The counts of docs/data-card.md, from the files themselves.
 
-Run it as `python -m lab.benchmarks.data_card [data/grasps] [--pictures docs/pictures]`.
+Run it as `python -m lab.benchmarks.data_card [data/grasps] [--pictures docs/pictures] [--json]`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dro_grasp.training.data.collections.collection import read_collection
 from dro_grasp.training.data.collections.coverage import measure_coverage
 from dro_grasp.training.data.collections.report import charts, grasps_drawn
 from dro_grasp.training.data.engine.shards import Yield
-from lab.benchmarks.report import ROOT
+from lab.benchmarks.report import ROOT, emit
 
 PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
@@ -44,18 +44,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "grasps", help="merged files")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of one hand")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     folder = options.folder
     if options.pictures is not None:
         (hand,) = measure_coverage(read_collection(folder / PICTURED))
         (options.pictures / "data-charts.png").write_bytes(charts(hand))
         (options.pictures / "data-grasps.png").write_bytes(grasps_drawn(hand))
-    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     files = sorted(folder.glob("*.parquet"))
-    for path in files:
-        print(f"| {' | '.join(row(path))} |")
-    print(f"\n{sum(len(p.grasps) for p in read_collection(folder)):,} grasps, "
-          f"{sum(path.stat().st_size for path in files) / 1e6:.1f} MB")
+    grasps, size = sum(len(p.grasps) for p in read_collection(folder)), sum(path.stat().st_size for path in files)
+    emit(f"{grasps:,} grasps, {size / 1e6:.1f} MB", rows := [row(path) for path in files], COLUMNS,
+         {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows], "grasps": grasps, "bytes": size}, options.json)
 
 
 if __name__ == "__main__":

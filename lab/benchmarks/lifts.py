@@ -10,6 +10,7 @@ repeated, and their plans are stored in it: `python -m lab.benchmarks.plan_check
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +109,7 @@ def main() -> None:
         parser.error("the mean grasp needs training grasps: --bundle PATH")
     arguments.output.mkdir(parents=True, exist_ok=True)
     objects, rows, lost = tuple(resolve_objects(arguments.objects)), [], []
+    attempts: list[dict[str, object]] = []
     for robot in arguments.robots:
         for kind in arguments.rows:
             run = TabletopRun(robot, objects, arguments.attempts, config=ROWS[kind])
@@ -118,9 +120,10 @@ def main() -> None:
                 output = arguments.output / f"{Path(robot).stem}.parquet"
                 done = run_tabletop(run, output, arguments.workers, plans=arguments.output / kind)
             rows.append(row(robot, kind, done))
+            attempts += [dataclasses.asdict(attempt) for attempt in done]
             lost += [f"{robot}, {kind}: {text}" for text in failures(done)]
     emit(f"Lifts, {arguments.attempts} attempts on each of {len(objects)} objects", rows, COLUMNS,
-         {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows], "failures": lost}, arguments.json)
+         {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows], "attempts": attempts, "failures": lost}, arguments.json)
 
 
 if __name__ == "__main__":

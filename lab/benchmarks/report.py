@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import subprocess
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dro_grasp.cli.output import print_json
 from dro_grasp.compare.metrics import wilson_interval
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,7 +51,7 @@ def emit(
         as_json: Print the object instead of the table.
     """
     if as_json:
-        print(json.dumps({**json_object, "machine": machine()}))
+        print_json({**json_object, "machine": machine()})
         return
     cells = [list(columns), *[[_cell(value) for value in row] for row in rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]

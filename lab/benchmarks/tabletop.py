@@ -1,6 +1,6 @@
 """Grasps of objects that rest on a table, from above and from the side: how many are returned, how soon, and how far above it.
 
-    python -m lab.benchmarks.tabletop [--hands allegro barrett] [--objects mug soap] [--method auto] [--trials] [--json]
+    python -m lab.benchmarks.tabletop [--hands allegro barrett] [--objects mug soap] [--source auto] [--trials] [--json]
 
 Every object lies in its most probable stable pose on a table. The clearance is that of the lowest vertex of the hand's
 collision shapes, in pregrasp, grasp and squeeze, of all grasps together; no stage of the prediction reads these shapes.
@@ -9,6 +9,7 @@ collision shapes, in pregrasp, grasp and squeeze, of all grasps together; no sta
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from dataclasses import dataclass
 
@@ -125,13 +126,14 @@ def main() -> None:
                 f"{sum(r.returned == options.num for r in own)} of {len(own)} objects with all {options.num} grasps; "
                 f"median {seconds[0]:.1f} s, 95 % {seconds[1]:.1f} s; processor time {cpu[0]:.1f} s, 95 % {cpu[1]:.1f} s"
                 + (f"; held {sum(r.held or 0 for r in own)} of {sum(r.returned for r in own)}" if options.trials else ""))
-    keys = {"all_returned": float(np.mean(whole)), "clearance_mm": 1e3 * min(row.clearance for row in rows), **summary}
+    keys = {"all_returned": float(np.mean(whole)), "clearance_mm": 1e3 * min(row.clearance for row in rows), **summary,
+            "rows": [dataclasses.asdict(row) | {"asked": options.num} for row in rows]}
     columns = ["hand", "object", "height [mm]", "from", "returned", "time [s]", "processor [s]", "clearance [mm]", "tilt [deg]",
                "held"]
     cells = [
         [r.hand, r.object, 1e3 * r.height, r.side, r.returned, r.seconds, r.cpu, 1e3 * r.clearance, float(np.rad2deg(r.tilt)),
          "-" if r.held is None else r.held] for r in rows]
-    emit(f"{options.num} grasps of objects that rest on a table, method {options.method}", cells, columns, keys, options.json)
+    emit(f"{options.num} grasps of objects that rest on a table, source {options.source}", cells, columns, keys, options.json)
 
 
 if __name__ == "__main__":

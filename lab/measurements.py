@@ -1,0 +1,135 @@
+"""What is measured for a release: named measurements, each of which is some commands that print one JSON object.
+
+`python -m lab.runner` runs them, `python -m lab.tables` writes what README and docs tell of them. Nothing in the package was
+chosen by what is measured here.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from lab.published_hands import HANDS as PUBLISHED
+
+PREPARED = "out/results"
+"""Folder of what commands need and make once: `PREPARATIONS`."""
+PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
+"""The hands of the paper."""
+UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgripper", "assets/orca")
+"""Hands that no weights were trained on."""
+OBJECTS = {"validate": "assets:validate", "test": "builtin:test"}
+"""Objects that no weights were trained on and by which nothing was chosen: the paper's and the built-in ones."""
+MADE_HANDS = 10
+"""Procedural hands, with seeds that no training used."""
+ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
+"""Built-in arms with hands."""
+FAST, ALL = "dro strict dexgraspbench", "dro strict dexgraspbench robust"
+"""Protocols: those of one trial a grasp, and with the one of eight."""
+CORE = ("devices.py", "frames.py", "kinds.py", "geometry", "network", "objects", "hands", "distance_matrix.py", "grasps",
+        "optimize", "simulation", "predict")
+"""What turns a hand and an object into grasps and tries them; all measurements rest on it."""
+PREPARATIONS = {
+    "bundle.safetensors": "dro-grasp dataset bundle data/grasps --hands " + " ".join(PAPER_HANDS)
+    + f" --output {PREPARED}/bundle.safetensors",
+    "made_hands": f"dro-grasp hand make --seed 9000 --num {MADE_HANDS} --output {PREPARED}/made_hands",
+    "published": f"python -m lab.published_hands {PREPARED}/published",
+}
+"""Commands that make the files of PREPARED, by name."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One question to the product, in as many commands as make resuming cheap."""
+
+    title: str
+    cells: Mapping[str, str] = field(repr=False)  # Commands by name
+    wings: tuple[str, ...] = ("compare",)  # What it rests on beside CORE, in src/dro_grasp
+    alone: bool = False  # Whether nothing may run beside it, as for times of the whole machine
+    device: str = "cpu"  # What it needs; a measurement of `cuda` is skipped where there is none
+
+
+def _short(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+def _benchmark(methods: str, hands: str, objects: str, options: str) -> str:
+    return f"dro-grasp benchmark --methods {methods} --hands {hands} --objects {objects} {options} --json"
+
+
+def _headline() -> dict[str, str]:
+    cells = {}
+    for where, objects in OBJECTS.items():
+        for hand in PAPER_HANDS:
+            name = f"{where}, {_short(hand)}"
+            cells[f"{name}, returned"] = _benchmark(
+                "auto", hand, objects, f"--num 48 --stages returned --protocols {ALL}")
+            cells[f"{name}, stages"] = _benchmark(
+                "network", hand, objects, f"--num 20 --stages raw refined settled --protocols {FAST}")
+            cells[f"{name}, controls"] = _benchmark(
+                "auto optimiser start mean-grasp", hand, objects,
+                f"--num 16 --stages equal-time --protocols {FAST} --bundle {PREPARED}/bundle.safetensors")
+    return cells
+
+
+def _unseen() -> dict[str, str]:
+    cells = {}
+    for hand in UNSEEN_HANDS:
+        cells[f"{_short(hand)}, returned"] = _benchmark(
+            "auto", hand, OBJECTS["validate"], f"--num 16 --stages returned --protocols {ALL}")
+        cells[f"{_short(hand)}, sources"] = _benchmark(
+            "network optimiser", hand, OBJECTS["validate"], f"--num 16 --stages returned --protocols {FAST}")
+        cells[f"{_short(hand)}, network alone"] = _benchmark(
+            "network", hand, OBJECTS["validate"], f"--num 12 --stages raw --protocols {FAST}")
+    return cells
+
+
+MEASUREMENTS = {
+    "headline": Measurement(
+        "The paper's hands on objects that no weights were trained on, with controls of equal time", _headline()),
+    "unseen": Measurement("Hands that no weights were trained on, on the paper's validate objects", _unseen()),
+    "procedural": Measurement("Hands that exist nowhere", {
+        f"hand {9000 + i}": _benchmark(
+            "auto", f"{PREPARED}/made_hands/hand_{9000 + i:05}.urdf", OBJECTS["validate"],
+            f"--num 8 --stages returned --protocols {FAST}")
+        for i in range(MADE_HANDS)}),
+    "published": Measurement("Hands as others publish them, on the built-in test objects", {
+        name: _benchmark("auto", shlex.quote(f"{PREPARED}/published/{path}"), OBJECTS["test"],
+                         f"--num 8 --stages returned --protocols {ALL}")
+        for name, path in PUBLISHED.items()}),
+    "views": Measurement("The paper's hands on objects seen in part", {
+        f"{view}, {_short(hand)}": _benchmark(
+            "auto", hand, OBJECTS["validate"], f"--view {view} --num 16 --stages returned --protocols {FAST}")
+        for view in ("cloud", "half", "depth") for hand in PAPER_HANDS}),
+    "lifts": Measurement("Arms that see an object in one depth image, plan, grasp, lift, hold and shake it", {
+        f"{robot}, {row}": f"python -m lab.benchmarks.lifts --robots {robot} --rows {row} --attempts {attempts} "
+        f"--output {PREPARED}/lifts --json"
+        for robot in ROBOTS for row, attempts in (("cloud", 2), ("random", 1))}, wings=("arm", "compare")),
+    "constraints": Measurement("What constraints cost, and whether what is returned respects them", {
+        name: "python -m lab.benchmarks.constraints --cases " + shlex.quote(name) + " --json"
+        for name in ("nothing", "direction", "max_tilt", "obstacles", "contact_region", "keep_out", "pregrasp_clearance")}),
+    "tables": Measurement("Objects that rest on a table, from above and from the side", {
+        hand: f"python -m lab.benchmarks.tabletop --hands {hand} --objects builtin:test --num 8 --trials --json"
+        for hand in ("allegro", "barrett")}),
+    "methods": Measurement("Methods of others, written anew here, beside ours", {
+        f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages returned "
+                                                f"--protocols {FAST}")
+        for hand in PAPER_HANDS
+        for method, source, num in (
+            ("DFC", "dfc", 8), ("GenDexGrasp", "lab.methods.gendexgrasp:GenDexGrasp", 4),
+            ("ManiFM-style", "lab.methods.manifm:ContactMethod", 8))
+        if method != "ManiFM-style" or "allegro" in hand}),
+    "fidelity": Measurement("The paper's own form, slim, trained as far as an hour of one core goes", {
+        "trained": f"python -m lab.studies.paper_form --bundle {PREPARED}/bundle.safetensors --output {PREPARED}/paper_form "
+        "--rows pretrained --seeds 0 --steps 1500 --pretraining-steps 500 --num 8 --json"}, wings=("compare", "training")),
+    "data": Measurement("The grasps that ship with the repository", {
+        "card": "python -m lab.benchmarks.data_card --json",
+        "again": "python -m lab.benchmarks.dataset data/grasps --sample 60 --json"}, wings=("compare", "training")),
+    "speed": Measurement("Times on the processor, nothing beside", {
+        name: f"python -m lab.benchmarks.{name} {options}--json" for name, options in (
+            ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", ""),
+            ("synthesis", ""))}, wings=("compare", "training", "cli"), alone=True),
+    "gpu": Measurement("Times on a GPU", {
+        "device": "python -m lab.benchmarks.device --quick --json"}, wings=("training",), alone=True, device="cuda"),
+}
+"""Everything that README and docs tell, by name."""

@@ -1,0 +1,137 @@
+"""What README and docs tell comes from lab/results: pages equal their data, a table is of one state, and nothing is typed."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from lab import pages, runner, tables
+from lab.measurements import MEASUREMENTS, Measurement
+
+PERCENT = re.compile(r"(?<![\w.])(?!95 %)\d+(?:\.\d+)? ?%")
+RATE = re.compile(r"\d+(?:\.\d+)? \[\d+-\d+\]")
+
+
+def test_pages_are_what_their_data_say() -> None:
+    assert [str(page.relative_to(runner.ROOT)) for page, _ in tables.outdated()] == []
+
+
+def test_the_figure_is_of_its_data() -> None:
+    assert not tables.figure_is_old(), "run `make tables`"
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_no_measured_number_is_typed(page: Path) -> None:
+    typed = pages.unmarked(page.read_text())
+    assert PERCENT.findall(typed) == []
+    assert RATE.findall(typed) == []
+
+
+def test_every_table_that_can_be_written_is_somewhere_and_none_is_twice() -> None:
+    named = [name for page in tables.PAGES for _, name, _ in pages.MARKED.findall(page.read_text())]
+    assert sorted(set(named)) == sorted({*tables.TABLES, *tables.VALUES})
+    tabled = [name for page in tables.PAGES for kind, name, _ in pages.MARKED.findall(page.read_text()) if kind == "table"]
+    assert len(tabled) == len(set(tabled))
+
+
+def test_results_are_of_commands_that_are_declared_and_of_a_commit() -> None:
+    for path in runner.RESULTS.glob("*.json"):
+        cells = json.loads(path.read_text())["cells"]
+        assert set(cells) <= set(MEASUREMENTS[path.stem].cells), path.name
+        for cell in cells.values():
+            assert re.fullmatch(r"[0-9a-f]{10}", cell["commit"]), path.name
+            assert {"command", "code", "weights", "machine", "date", "load", "seconds", "result"} <= set(cell)
+
+
+def kept(folder: Path, name: str, changes: dict) -> dict:
+    """A result in a folder of its own, changed."""
+    cells = json.loads((runner.RESULTS / f"{name}.json").read_text())["cells"]
+    first = next(iter(cells))
+    cells[first] = {**cells[first], **changes}
+    (folder / f"{name}.json").write_text(json.dumps({"cells": cells}))
+    return cells
+
+
+@pytest.mark.parametrize("changes", [{"weights": {"more.safetensors": "0"}}, {"code": {"src/dro_grasp/simulation": "0"}}])
+def test_a_table_of_two_states_is_refused(tmp_path: Path, changes: dict) -> None:
+    kept(tmp_path, "constraints", changes)
+    with pytest.raises(ValueError, match="mix states"):
+        tables.writer("constraints.cost", tables.constraints, tmp_path)
+
+
+def test_what_was_not_measured_says_so(tmp_path: Path) -> None:
+    assert tables.writer("constraints.cost", tables.constraints, tmp_path) == (
+        "not measured (`make results NAMES=constraints`)")
+
+
+def test_a_page_is_written_between_its_markers_only() -> None:
+    text = "a <!-- value one -->old<!-- end --> b\n<!-- table two -->\nold\n<!-- end -->\n"
+    wanted = "a <!-- value one -->1 %<!-- end --> b\n<!-- table two -->\n| x |\n<!-- end -->\n"
+    assert pages.rendered(text, {"two": lambda: "| x |"}, {"one": lambda: "1 %"}) == wanted
+    assert pages.unmarked(wanted + "5 `6 %`") == "a  b\n\n5 "
+    with pytest.raises(KeyError):
+        pages.rendered(text, {}, {})
+
+
+class TestRunner:
+    """A measurement of one quick command, with its results in a folder of their own."""
+
+    @pytest.fixture(autouse=True)
+    def one(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        script = tmp_path / "count.py"
+        script.write_text(
+            f"import pathlib\nseen = pathlib.Path({str(tmp_path / 'seen')!r})\nwith seen.open('a') as f:\n    f.write('x')\n"
+            "print('noise')\nprint('{\"number\": 1}')\n")
+        monkeypatch.setattr(runner, "MEASUREMENTS", {"quick": Measurement("A number", {"one": f"python {script}"}, ())})
+        monkeypatch.setattr(runner, "RESULTS", tmp_path / "results")
+        monkeypatch.setattr(runner, "uncommitted", list)
+        self.seen = tmp_path / "seen"
+
+    def runs(self) -> int:
+        return len(self.seen.read_text()) if self.seen.exists() else 0
+
+    def test_what_is_there_is_not_run_again(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert runner.main(["--stale"]) == 1
+        assert "1 of 1 commands, missing" in capsys.readouterr().out
+        assert runner.main([]) == 0
+        assert runner.main([]) == 0
+        assert self.runs() == 1
+        assert runner.read("quick")["cells"]["one"]["result"] == {"number": 1}
+        assert runner.main(["--stale"]) == 0
+
+    def test_what_is_older_than_its_code_or_weights_is_run_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        runner.main([])
+        monkeypatch.setattr(runner, "weights_hashes", lambda: {"new.safetensors": "1"})
+        (job,) = runner.jobs_of("quick", runner.MEASUREMENTS["quick"])
+        assert "new.safetensors" in runner.reason(job)
+        runner.main([])
+        assert self.runs() == 2
+
+    def test_a_command_that_fails_is_told_and_keeps_nothing(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fault = Measurement("A fault", {"one": "python -c 'raise SystemExit(\"no\")'"}, ())
+        monkeypatch.setattr(runner, "MEASUREMENTS", {"quick": fault})
+        assert runner.main([]) == 1
+        assert "no" in capsys.readouterr().out
+        assert not (runner.RESULTS / "quick.json").exists()
+
+    def test_nothing_is_measured_with_uncommitted_changes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(runner, "uncommitted", lambda: ["src/dro_grasp/kinds.py"])
+        with pytest.raises(SystemExit):
+            runner.main([])
+        assert self.runs() == 0
+
+
+def test_code_counts_by_its_syntax_without_docstrings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "ROOT", tmp_path)
+    hashes = []
+    for text in ('"""One."""\nx = 1\n', '"""Two."""\n\n# Why.\nx = 1\n', '"""One."""\nx = 2\n'):
+        (tmp_path / "m.py").write_text(text)
+        runner.code_hash.cache_clear()
+        hashes.append(runner.code_hash("m.py"))
+    runner.code_hash.cache_clear()
+    assert hashes[0] == hashes[1] != hashes[2]
