@@ -118,7 +118,9 @@ def of(held: int, asked: int) -> str:
 
 
 def table(columns: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
-    """Markdown."""
+    """Markdown; a column that is empty everywhere is left out."""
+    filled = [i for i, _ in enumerate(columns) if i == 0 or any(str(line[i]) for line in lines)]
+    columns, lines = [columns[i] for i in filled], [[line[i] for i in filled] for line in lines]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (columns, ["---"] * len(columns), *lines))
 
 
@@ -129,10 +131,15 @@ def line(label: str, row: Row, *more: object) -> list[object]:
     """A row's cells: asked, returned, success, fingers that touch under `strict`, and what else is given."""
     share, everyone = row.fingers["strict"]
     rates = [percent(row.success[p]) if p in row.success else "" for p in PROTOCOLS]
-    return [label, row.asked, row.returned, *rates, f"{100 * share:.0f} ({100 * everyone:.0f})", *more]
+    return [label, f"{row.asked}/{row.returned}", *rates, f"{100 * share:.0f} ({100 * everyone:.0f})", *more]
 
 
-HEAD = ["", "asked", "returned", *(f"`{p}` [%]" for p in PROTOCOLS), "fingers (all) [%]"]
+HEAD = ["", "asked/returned", *(f"`{p}` [%]" for p in PROTOCOLS), "fingers (all) [%]"]
+
+
+def plain(hand: str) -> str:
+    """A hand's name without the folder of the assets."""
+    return hand.removeprefix("assets/")
 
 
 def select(rows: Sequence[Row], grasps: str, stage: str) -> list[Row]:
@@ -157,8 +164,8 @@ def headline_stages(results: Results, where: str) -> str:
     """What each step adds, and what is returned of each hand."""
     returned, stages = results.rows("headline", where, "returned"), results.rows("headline", where, "stages")
     lines = [line(text, average(select(stages, "network", stage))) for stage, text in STAGES.items()]
-    lines += [line(f"returned by `generate`, {row.hand}", row) for row in returned]
-    return table(HEAD, [*lines, line("**returned by `generate`, all**", average(returned))])
+    lines += [line(f"returned, {plain(row.hand)}", row) for row in returned]
+    return table(HEAD, [*lines, line("**returned by `generate`**", average(returned))])
 
 
 def headline_controls(results: Results, where: str) -> str:
@@ -175,7 +182,7 @@ def diversity(results: Results) -> str:
     rows = results.rows("headline", "validate", "returned")
     alone = select(results.rows("headline", "validate", "stages"), "network", "raw")
     return table(["hand", "returned", "network alone"],
-                 [[a.hand, f"{a.diversity:.3f}", f"{b.diversity:.3f}"] for a, b in zip(rows, alone, strict=True)])
+                 [[plain(a.hand), f"{a.diversity:.3f}", f"{b.diversity:.3f}"] for a, b in zip(rows, alone, strict=True)])
 
 
 def unseen(results: Results) -> str:
@@ -186,8 +193,8 @@ def unseen(results: Results) -> str:
                        ("optimiser", "by the optimiser alone, finished")):
         own = select(rows, name, "returned")
         if name == "auto":
-            lines += [line(f"{text}, {row.hand}", row, f"{100 * row.optimised:.0f}") for row in own]
-        lines.append(line(f"**{text}, all**", average(own), f"{100 * average(own).optimised:.0f}"))
+            lines += [line(f"returned, {plain(row.hand)}", row, f"{100 * row.optimised:.0f}") for row in own]
+        lines.append(line(f"**{text}**", average(own), f"{100 * average(own).optimised:.0f}"))
     alone = average(select(results.rows("unseen", ending="network alone"), "network", "raw"))
     return table([*HEAD, "optimiser's [%]"], [*lines, line("network alone, nothing refined", alone, 0)])
 
