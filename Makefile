@@ -64,7 +64,7 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
 	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
 		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
-		PRETRAIN='--size slim --steps 4 --motion-steps 4' TRAIN='--size slim --steps 10 --validation-samples 20'; \
+		PRETRAIN='--preset slim --steps 4 --motion-steps 4' TRAIN='--preset slim --steps 10 --validation-samples 20'; \
 	timeout --signal KILL 20 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
 	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors

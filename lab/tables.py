@@ -316,7 +316,8 @@ def state(results: Results) -> str:
     where, weights = cells[0]["machine"], cells[0]["weights"]
     digest = next(v for k, v in weights.items() if "/" not in k)
     return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} "
-            f"cores of an {where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, MuJoCo {where['mujoco']}.")
+            f"cores of an {where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, "
+            f"MuJoCo {where['mujoco']}.")
 
 
 def gpu(results: Results) -> str:
