@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | demo-arm | test | test-full | results | results-stale | tables | lint | wheels | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -28,8 +28,9 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
-test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
-	$(BIN)/python -m pytest -q -m slow
+test-full: setup  # every test, with shape checks: also what is slow, starts a browser or Ray, or builds the wheel
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -q -m alone
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu and not alone'
 
 NAMES :=
 results: setup  # measure what is missing or older than its code (NAMES="headline speed"; everything takes a night)
@@ -63,13 +64,13 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
 	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
 		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
-		PRETRAIN='--size slim --steps 4 --motion-steps 4' TRAIN='--size slim --steps 10 --validation-samples 20'; \
+		PRETRAIN='--preset slim --steps 4 --motion-steps 4' TRAIN='--preset slim --steps 10 --validation-samples 20'; \
 	timeout --signal KILL 20 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
 	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors
 
 docs-pictures: setup
-	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
+	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 8 --seed 0 --picture docs/pictures/grasps.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 --video docs/pictures/lift.webp
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans

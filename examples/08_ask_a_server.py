@@ -5,7 +5,7 @@ import sys
 
 import dro_grasp as dro
 
-# A robot's own computer starts it once: dro-grasp serve --hand my_hand.urdf. Needs the extra serve.
+# A robot's own computer starts it once: dro-grasp serve --hand my_hand.urdf. Needs the extra apps.
 server = subprocess.Popen([sys.executable, "-m", "dro_grasp", "serve", "--hand", "allegro", "--port", "0"],
                           stderr=subprocess.PIPE, text=True)
 try:

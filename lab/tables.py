@@ -87,9 +87,9 @@ def as_row(line: dict[str, Any]) -> Row:
 
 
 def _numbers(value: Any) -> Any:
-    """Nothing becomes NaN again."""
+    """Nothing becomes NaN again, and the label of a protocol its name."""
     if isinstance(value, dict):
-        return {key: _numbers(v) for key, v in value.items()}
+        return {key.partition("/")[0]: _numbers(v) for key, v in value.items()}
     if isinstance(value, list):
         return tuple(_numbers(v) for v in value)
     return math.nan if value is None else value
@@ -118,7 +118,9 @@ def of(held: int, asked: int) -> str:
 
 
 def table(columns: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
-    """Markdown."""
+    """Markdown; a column that is empty everywhere is left out."""
+    filled = [i for i, _ in enumerate(columns) if i == 0 or any(str(line[i]) for line in lines)]
+    columns, lines = [columns[i] for i in filled], [[line[i] for i in filled] for line in lines]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (columns, ["---"] * len(columns), *lines))
 
 
@@ -129,10 +131,15 @@ def line(label: str, row: Row, *more: object) -> list[object]:
     """A row's cells: asked, returned, success, fingers that touch under `strict`, and what else is given."""
     share, everyone = row.fingers["strict"]
     rates = [percent(row.success[p]) if p in row.success else "" for p in PROTOCOLS]
-    return [label, row.asked, row.returned, *rates, f"{100 * share:.0f} ({100 * everyone:.0f})", *more]
+    return [label, f"{row.asked}/{row.returned}", *rates, f"{100 * share:.0f} ({100 * everyone:.0f})", *more]
 
 
-HEAD = ["", "asked", "returned", *(f"`{p}` [%]" for p in PROTOCOLS), "fingers (all) [%]"]
+HEAD = ["", "asked/returned", *(f"`{p}` [%]" for p in PROTOCOLS), "fingers (all) [%]"]
+
+
+def plain(hand: str) -> str:
+    """A hand's name without the folder of the assets."""
+    return hand.removeprefix("assets/")
 
 
 def select(rows: Sequence[Row], grasps: str, stage: str) -> list[Row]:
@@ -157,8 +164,8 @@ def headline_stages(results: Results, where: str) -> str:
     """What each step adds, and what is returned of each hand."""
     returned, stages = results.rows("headline", where, "returned"), results.rows("headline", where, "stages")
     lines = [line(text, average(select(stages, "network", stage))) for stage, text in STAGES.items()]
-    lines += [line(f"returned by `generate`, {row.hand}", row) for row in returned]
-    return table(HEAD, [*lines, line("**returned by `generate`, all**", average(returned))])
+    lines += [line(f"returned, {plain(row.hand)}", row) for row in returned]
+    return table(HEAD, [*lines, line("**returned by `generate`**", average(returned))])
 
 
 def headline_controls(results: Results, where: str) -> str:
@@ -175,19 +182,19 @@ def diversity(results: Results) -> str:
     rows = results.rows("headline", "validate", "returned")
     alone = select(results.rows("headline", "validate", "stages"), "network", "raw")
     return table(["hand", "returned", "network alone"],
-                 [[a.hand, f"{a.diversity:.3f}", f"{b.diversity:.3f}"] for a, b in zip(rows, alone, strict=True)])
+                 [[plain(a.hand), f"{a.diversity:.3f}", f"{b.diversity:.3f}"] for a, b in zip(rows, alone, strict=True)])
 
 
 def unseen(results: Results) -> str:
     """Hands that no weights were trained on, by source."""
-    rows = results.rows("unseen", ending="returned")
+    rows = [*results.rows("unseen", ending="returned"), *results.rows("unseen", ending="sources")]
     lines = []
     for name, text in (("auto", "returned by `generate`"), ("network", "by the network alone, finished"),
                        ("optimiser", "by the optimiser alone, finished")):
         own = select(rows, name, "returned")
         if name == "auto":
-            lines += [line(f"{text}, {row.hand}", row, f"{100 * row.optimised:.0f}") for row in own]
-        lines.append(line(f"**{text}, all**", average(own), f"{100 * average(own).optimised:.0f}"))
+            lines += [line(f"returned, {plain(row.hand)}", row, f"{100 * row.optimised:.0f}") for row in own]
+        lines.append(line(f"**{text}**", average(own), f"{100 * average(own).optimised:.0f}"))
     alone = average(select(results.rows("unseen", ending="network alone"), "network", "raw"))
     return table([*HEAD, "optimiser's [%]"], [*lines, line("network alone, nothing refined", alone, 0)])
 
@@ -280,6 +287,58 @@ def commands(results: Results) -> str:
     return table(["command", "median [s]"], [[f"`{name}`", f"{seconds:.1f}"] for name, seconds in told.items()])
 
 
+def parts(results: Results) -> str:
+    """Parts beside what they replace, and rates of work."""
+    cell = {name: results.cell("speed", name) for name in ("inference", "joint_solver", "kernel", "trials", "synthesis")}
+    alone, many = cell["inference"]["latency_default"], cell["inference"]["batch16_per_grasp_default"]
+    return table(["part", "measured"], [
+        ["one grasp of one candidate, network to score [ms]", f"{1e3 * alone:.0f}"],
+        ["one of sixteen such grasps [ms]", f"{1e3 * many:.0f}"],
+        ["joint solver against CVXPY and Clarabel, one thread", f"{cell['joint_solver']['speedup']:.0f} times faster"],
+        ["kernel against the form that writes every pair, one thread", f"{cell['kernel']['speedup']:.0f} times faster, "
+         f"{100 * cell['kernel']['memory_ratio']:.0f} % of the memory"],
+        ["trials of `dro` a second, all cores", f"{cell['trials']['trials_per_second']:.0f}"],
+        ["synthesised grasps that pass `strict`, an hour of a core", f"{cell['synthesis']['strict_valid_per_cpu_hour']:,.0f}"],
+    ])
+
+
+def again(results: Results) -> str:
+    """Stored grasps that pass their protocol again."""
+    rows = results.cell("data", "again")["again"]
+    return table(["trial", "grasps", "held [%]"], [
+        [row["trial"], row["asked"], of(round(row["asked"] * row["success"] / 100), row["asked"])] for row in rows])
+
+
+def state(results: Results) -> str:
+    """Of which state and machine the headline is."""
+    results.cells("headline")
+    cells = list(results.used.values())
+    where, weights = cells[0]["machine"], cells[0]["weights"]
+    digest = next(v for k, v in weights.items() if "/" not in k)
+    return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} "
+            f"cores of an {where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, "
+            f"MuJoCo {where['mujoco']}.")
+
+
+def gpu(results: Results) -> str:
+    """What a GPU does, if one was at hand."""
+    found = results.cell("gpu", "device")
+    return f"{found['machine']['cuda']}: see `lab/results/gpu.json`."
+
+
+def training_told(results: Results) -> str:
+    """How long the paper's form was trained."""
+    (found,) = results.cell("fidelity", "trained")["pretrained"]
+    return f"trained for {found['seconds'] / 60:.0f} minutes of one core"
+
+
+def lifted(results: Results, robot: str) -> str:
+    """Share of attempts in which a robot held the object."""
+    tried = results.cell("lifts", f"{robot}, cloud")["attempts"]
+    held = success_rate(sum(a["success"] for a in tried), len(tried))
+    return f"{100 * held[0]:.0f} % [{100 * held[1]:.0f}-{100 * held[2]:.0f}]"
+
+
 def figure_data(results: Results) -> dict[str, dict[str, Sequence[float]]]:
     """Success and interval of each method under each protocol."""
     rows, stages = (results.rows("headline", "validate", ending) for ending in ("returned", "stages"))
@@ -333,9 +392,16 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "fidelity.form": fidelity,
     "data.card": data_card,
     "speed.commands": commands,
+    "speed.parts": parts,
+    "data.again": again,
 }
 """Tables by name."""
-VALUES: dict[str, Callable[[Results], str]] = {}
+VALUES: dict[str, Callable[[Results], str]] = {
+    "results.machine": state,
+    "gpu.told": gpu,
+    "fidelity.training": training_told,
+    **{f"lifts.{robot}": functools.partial(lifted, robot=robot) for robot in ROBOTS},
+}
 """Single numbers by name."""
 
 

@@ -1,4 +1,4 @@
-"""Shape checks for every test, and the fixtures that several files share."""
+"""Shape checks, and the fixtures that several files share."""
 
 from __future__ import annotations
 
@@ -9,12 +9,21 @@ from pathlib import Path
 # Each worker of pytest-xdist has a core of its own; with more threads they wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import jaxtyping
 import pytest
 
-import tests.helpers.typecheck  # noqa: F401  (must be imported before the hook is installed)
+if os.environ.get("CHECK_SHAPES"):  # as `make test-full` sets it
+    import jaxtyping
 
-jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
+    import tests.helpers.typecheck  # noqa: F401  (must be imported before the hook is installed)
+
+    jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
+
+
+@pytest.fixture
+def as_users_have_it() -> None:
+    """Skips where the check of shapes comes first, and refuses by its own words."""
+    if os.environ.get("CHECK_SHAPES"):
+        pytest.skip("shapes are checked; make test runs it")
 
 
 @pytest.fixture(scope="session")

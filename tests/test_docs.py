@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.cli.main import parse
+from dro_grasp.cli.main import main, parse
 from dro_grasp.frames import read_motion
 from tests.helpers.weights import untrained_weights
 
@@ -35,9 +38,10 @@ def blocks(language: str) -> list[tuple[str, str]]:
 
 
 def commands() -> list[str]:
-    """Every line of shell in the documents, and of the examples in --help."""
+    """Every command of shell in the documents, and of the examples in --help."""
     texts = [text.replace("\\\n", " ") for _, text in blocks("bash")]
-    lines = [re.split(r"(?:^|\s)#", line)[0].strip() for text in texts for line in text.splitlines()]
+    parts = [part for text in texts for line in text.splitlines() for part in line.split("&&")]
+    lines = [re.split(r"(?:^|\s)#", part)[0].strip() for part in parts]
     for file in (ROOT / "src" / "dro_grasp" / "cli").glob("*.py"):
         for example in re.findall(r"Example: (.*?)\n    (?:\"\"\"|\n)", file.read_text(), re.DOTALL):
             lines.append(" ".join(example.split()))
@@ -60,6 +64,8 @@ def test_commands_are_understood(command: str) -> None:
         assert words[1] in MAKE_TARGET.findall((ROOT / "Makefile").read_text())
     elif words[0] == "dro-grasp":
         assert_folders_exist(parse(words[1:]))
+    elif words[:3] == ["python3", "-m", "venv"]:
+        assert len(words) == 4, command
     elif words[:2] == ["python", "-m"]:
         assert (ROOT / f"{words[2].replace('.', '/')}.py").exists(), words[2]
     elif words[0].startswith("scripts/"):
@@ -102,18 +108,54 @@ def test_python_parses_and_uses_public_names() -> None:
 
 
 def test_the_snippets_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The README's, then the one that reads its file; a small hand and untrained weights keep it quick."""
+    """The README's and that of first-grasps.md, then the one that reads their file.
+
+    A small hand and untrained weights keep it quick.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("dro_grasp.network.checkpoints.locate_weights", lambda name=None: untrained_weights(tmp_path))
-    readme = next(t for d, t in blocks("python") if d == "README.md")
+    quicker = {'"allegro"': '"gripper3"', '"mug"': '"sphere"', "num=16": "num=2"}
+    for document in ("README.md", "first-grasps.md"):
+        (text,) = (t for d, t in blocks("python") if d == document)
+        for usual, quick in quicker.items():
+            assert usual in text, document
+            text = text.replace(usual, quick)
+        names: dict = {}
+        exec(compile(text, document, "exec"), names)
+        names["grasps"].save("grasps.parquet")
+    assert (tmp_path / "grasps.png").exists()
     reader = next(t for d, t in blocks("python") if d == "file-formats.md")
-    quick = readme.replace('"allegro"', '"gripper3"').replace('"mug"', '"sphere"').replace("num=16", "num=2")
-    assert quick != readme
-    names: dict = {}
-    exec(compile(quick, "README.md", "exec"), names)
-    names["grasps"].save("grasps.parquet")
     exec(compile(reader, "file-formats.md", "exec"), {})
     assert "a_base" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_first_lines_work_in_a_fresh_shell(tmp_path: Path) -> None:
+    """The README's first block as it stands, but for the installation, which the tests' environment has."""
+    installed = {"python3", "pip"}
+    lines = next(t for d, t in blocks("bash") if d == "README.md").splitlines()
+    assert len(lines) == 5
+    *quick, last = [line for line in lines if line.split()[0] not in installed]
+    kept = {"HOME", "LANG", "TMPDIR", "PYTHONPATH", "DRO_GRASP_CACHE"}
+    environment = {name: value for name, value in os.environ.items() if name in kept}
+    environment["PATH"] = f"{Path(sys.executable).parent}:/usr/bin:/bin"
+    shell = {"cwd": tmp_path, "env": environment, "text": True}
+    done = subprocess.run(["bash", "-eu", "-c", "\n".join(quick)], capture_output=True, timeout=600, **shell)
+    assert done.returncode == 0, done.stderr
+    assert "8 of 8 grasps succeeded" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"grasps.parquet", "grasps.png"}
+    with subprocess.Popen(["bash", "-eu", "-c", f"exec timeout 120 {last}"], stderr=subprocess.PIPE, **shell) as viewer:
+        assert any("viewer: http://127.0.0.1" in line for line in viewer.stderr)
+        viewer.terminate()
+
+
+@pytest.mark.slow
+def test_a_request_that_cannot_be_met_says_what_the_page_says(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / "docs" / "first-grasps.md").read_text()
+    command = next(line for line in page.splitlines() if "--direction 0 0 1 --table" in line)
+    said = next(m[2] for m in BLOCK.finditer(page) if m[2].startswith("error:"))
+    assert main(shlex.split(command)[1:]) == 2
+    assert " ".join(capsys.readouterr().err.split()) == " ".join(said.split())
 
 
 def test_json_example_has_the_keys_of_generate() -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pydoc
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -64,17 +65,18 @@ def test_a_name_or_swapped_arguments_say_what_is_wanted(hand, obj) -> None:
             require_pair(*wrong)
 
 
-def test_so_do_the_functions_that_take_a_pair() -> None:
-    code = ("import dro_grasp as dro\nhand, obj = dro.load_hand('gripper3'), dro.load_object('sphere')\n"
-            "grasps = dro.palm_facing_starts(hand, obj, num=1, seed=0)\n"
-            "for call in (lambda: dro.GraspPredictor.predict(type('P', (), {'device': 'cpu'})(), 'allegro', obj),\n"
-            "             lambda: dro.simulate(obj, hand, grasps), lambda: dro.draw_grasps(hand, 'mug', grasps, 'a.png')):\n"
-            "    try: call()\n    except dro.DroGraspError as error: print(error)")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    predict, simulate, draw = done.stdout.splitlines()
-    assert predict == "the hand is 'allegro'; load it first: dro_grasp.load_hand('allegro')"
-    assert "swapped" in simulate
-    assert "load_object('mug')" in draw
+@pytest.mark.usefixtures("as_users_have_it")
+def test_so_do_the_functions_that_take_a_pair(hand, obj) -> None:
+    grasps = dro.palm_facing_starts(hand, obj, num=1, seed=0)
+    predictor: Any = SimpleNamespace(device="cpu")
+    calls: list[tuple[Callable[[], object], str]] = [
+        (lambda: dro.GraspPredictor.predict(predictor, "allegro", obj),
+         r"^the hand is 'allegro'; load it first: dro_grasp.load_hand\('allegro'\)$"),
+        (lambda: dro.simulate(obj, hand, grasps), "swapped"),
+        (lambda: dro.draw_grasps(hand, "mug", grasps, "a.png"), r"load_object\('mug'\)")]
+    for call, told in calls:
+        with pytest.raises(dro.DroGraspError, match=told):
+            call()
 
 
 def test_successes_are_not_asked_of_grasps_without_a_trial(hand, obj) -> None:

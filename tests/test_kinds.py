@@ -7,8 +7,6 @@ import importlib
 import inspect
 import math
 import pkgutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
@@ -110,12 +108,10 @@ def calls_of_the_package() -> None:
             call()
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("check", [every_configuration, requests_and_constraints, calls_of_the_package])
 def test_where_no_shapes_are_checked_numbers_are_told_from_texts(check: Callable[[], None]) -> None:
-    """As users have it: in this process the check of shapes comes first, and refuses by its own words."""
-    code = f"from tests import test_kinds; test_kinds.{check.__name__}()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    check()
 
 
 def test_functions_take_them_too() -> None:

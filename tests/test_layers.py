@@ -7,12 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 BARE = ("dro_grasp.training.loop", "dro_grasp.training.pretraining", "dro_grasp.training.data.bundle.training_file",
         "dro_grasp.network.checkpoints", "dro_grasp.hands.hand")
 FORBIDDEN = ("mujoco", "trimesh", "viser", "igl", "coacd", "matplotlib", "PIL", "rich", "tyro")
 
 
+@pytest.mark.slow
 def test_imports_point_downwards_only() -> None:
     tool = Path(sys.executable).parent / "lint-imports"
     done = subprocess.run([tool, "--no-logo", "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)

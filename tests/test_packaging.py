@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import dro_grasp
 
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_a_missing_wheel_fails_the_check_and_is_named(tmp_path: Path) -> None:
     environment = os.environ | {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(tmp_path), "PIP_CONFIG_FILE": os.devnull}
     done = subprocess.run(
@@ -22,6 +28,14 @@ def test_a_missing_wheel_fails_the_check_and_is_named(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "Python 3.13" in done.stderr
     assert "torch" in done.stderr
+
+
+def test_the_version_is_the_same_wherever_it_is_stated() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    newest, date = re.search(r"^## (\S+) \((\S+)\)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE).groups()
+    assert {project["version"], citation["version"], newest} == {dro_grasp.__version__}
+    assert str(citation["date-released"]) == date
 
 
 @pytest.mark.slow

@@ -20,13 +20,15 @@ STUB = [node for node in ast.parse(Path(dro.__file__).with_suffix(".pyi").read_t
 NAMES = sorted(set(dro.__all__) - {"__version__"})
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_public_name_has_a_docstring_of_its_own(name: str) -> None:
-    value = getattr(dro, name)
-    # A dataclass without a docstring gets its signature, a subclass its parent's.
-    own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
-    assert own, name
-    assert not own.startswith(f"{name}("), name
+def test_every_public_name_has_a_docstring_of_its_own() -> None:
+    without = []
+    for name in NAMES:
+        value = getattr(dro, name)
+        # A dataclass without a docstring gets its signature, a subclass its parent's.
+        own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+        if not own or own.startswith(f"{name}("):
+            without.append(name)
+    assert without == []
 
 
 def test_the_list_of_names_states_each_once_and_for_type_checkers() -> None:

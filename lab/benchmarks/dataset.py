@@ -73,7 +73,8 @@ def main() -> None:
     emit(f"{options.sample} random grasps of {len({p.hand for p in pairs})} hands evaluated again", repeated,
          ["trial", "grasps", "success [%]", "95 %"],
          {"valid_per_cpu_hour": speeds, "diversity": {str(r[0]): r[5] for r in rows},
-          "pairs": {str(r[0]): r[4] for r in rows}, "success_again": {str(r[0]): r[2] for r in repeated}}, options.json)
+          "pairs": {str(r[0]): r[4] for r in rows},
+          "again": [{"trial": r[0], "asked": r[1], "success": r[2]} for r in repeated]}, options.json)
 
 
 if __name__ == "__main__":

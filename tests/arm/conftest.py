@@ -1,7 +1,8 @@
-"""A plan that several tests look at."""
+"""A plan that several tests look at, and what MuJoCo compiles."""
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +10,7 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.workcell import ARM
 
 PLACE = (0.5, 0.1)
 
@@ -33,3 +35,17 @@ def standing() -> tuple[dro.ObjectModel, np.ndarray]:
 @pytest.fixture(scope="session")
 def planned(robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]) -> MotionPlan:
     return plan(robot, *standing, obstacles=[wall], config=PlanConfig(num=12), seed=0)
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> list[mujoco.MjSpec]:
+    """Scenes with an arm that MuJoCo compiled; settling grasps compiles that of hand and object alone."""
+    found, compiling = [], mujoco.MjSpec.compile
+
+    def counted(spec: mujoco.MjSpec) -> mujoco.MjModel:
+        if any(body.name.startswith(ARM) for body in spec.bodies):
+            found.append(spec)
+        return compiling(spec)
+
+    monkeypatch.setattr(mujoco.MjSpec, "compile", counted)
+    return found

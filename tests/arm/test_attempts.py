@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -94,11 +95,15 @@ def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: Lif
     assert depth[row, column] == 0, "the hand is in view"
 
 
-def test_an_attempt_lifts_a_can_and_becomes_an_animation(robot: dro.Robot, can: dro.ObjectModel, tmp_path: Path) -> None:
-    recorder = Recorder()
+def test_an_attempt_lifts_a_can_and_becomes_an_animation(
+    robot: dro.Robot, can: dro.ObjectModel, tmp_path: Path, compiled: list[mujoco.MjSpec]
+) -> None:
+    robot, recorder = replace(robot, home=robot.home - 1e-3), Recorder()  # no other test has this home
+    compiled.clear()
     result = attempt(robot, can, 0, 0, dro.GraspPredictor(), QUICK, recorder)
     assert result.stage == "done", result.reason
     assert result.raised > 0.15
+    assert len(compiled) == 5, "the table of the attempt, beside the four models of a plan"
     assert len(recorder.frames) == pytest.approx(10 * (result.motion_seconds + 1.0), abs=2)
     recorder.frames = recorder.frames[::20]
     draw_animation(robot, recorder, tmp_path / "lift.gif")

@@ -14,11 +14,10 @@ from scipy.spatial import KDTree
 
 import dro_grasp as dro
 from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.planner import PlanConfig
+from dro_grasp.arm.planner import PlanConfig, grasps_in_world
 from dro_grasp.arm.robot import load_robot
 from dro_grasp.arm.robot_check import check_robot
-from dro_grasp.arm.tabletop import TabletopConfig, attempt
-from dro_grasp.arm.workcell import ARM, VOXEL, Workcell, occupied, scene_solid
+from dro_grasp.arm.workcell import VOXEL, Workcell, occupied, scene_solid
 from dro_grasp.cli.main import main
 from dro_grasp.errors import PlanError, RobotError
 
@@ -81,43 +80,20 @@ def test_a_carried_object_hits_obstacles_and_leaves_the_table_in_peace(robot: dr
     assert not cell.free(robot.home, fingers, moved=up, touch=True)
 
 
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> list[mujoco.MjSpec]:
-    """Scenes with an arm that MuJoCo compiled; settling grasps compiles that of hand and object alone."""
-    found, compiling = [], mujoco.MjSpec.compile
-
-    def counted(spec: mujoco.MjSpec) -> mujoco.MjModel:
-        if any(body.name.startswith(ARM) for body in spec.bodies):
-            found.append(spec)
-        return compiling(spec)
-
-    monkeypatch.setattr(mujoco.MjSpec, "compile", counted)
-    return found
-
-
 def test_each_model_of_a_robot_is_compiled_once(compiled: list[mujoco.MjSpec]) -> None:
     robot, can = load_robot("xarm7_leaphand"), dro.load_object("can")  # read before: their own models are compiled
     robot = replace(robot, home=robot.home + 1e-3)  # no other test has it
     place, config = np.array([0.5, 0.1, -float(can.cloud[:, 2].min())]), PlanConfig(num=4, rehearsals=1, batches=1)
     T = np.eye(4)
     T[:3, 3] = place
+    request = dro.GraspRequest(4, candidates=1)
+    grasps = grasps_in_world(dro.GraspPredictor(), robot.hand, can, T, request, dro.Constraints(table=0.0))
     compiled.clear()
-    dro.plan(robot, can, T, config=config)
+    dro.plan(robot, can, T, config=config, grasps=grasps)
     assert len(compiled) == 4, "the arm, the robot alone, the workcell, and the rehearsal"
     compiled.clear()
-    dro.plan(replace(robot, table=replace(robot.table, height=-0.001), camera=None), can, T, config=config)
+    dro.plan(replace(robot, table=replace(robot.table, height=-0.001), camera=None), can, T, config=config, grasps=grasps)
     assert len(compiled) == 2, "a table that was seen elsewhere makes no other robot"
-
-
-def test_an_attempt_compiles_its_table_beside_the_plan(compiled: list[mujoco.MjSpec]) -> None:
-    robot, can = load_robot("xarm7_leaphand"), dro.load_object("can")
-    robot = replace(robot, home=robot.home - 1e-3)
-    plan = PlanConfig(num=4, rehearsals=1, batches=1)
-    compiled.clear()
-    config = TabletopConfig(see="mesh", hold_seconds=0.1, shake_seconds=0.1, plan=plan)
-    made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)
-    assert made.motion_seconds > 0, made.reason
-    assert len(compiled) == 5
 
 
 FOOT = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><geom type="cylinder" size="0.08 0.01" pos="0 0 0.01"/>

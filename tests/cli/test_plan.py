@@ -81,11 +81,21 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
     Path("pose.json").write_text(json.dumps({"frame": "world", "T_frame_object": T}))
     assert planned("--pose", "pose.json", "--csv", "plan.csv") == 0
     np.testing.assert_allclose(asked["T"], T, atol=1e-7)
-    said = capsys.readouterr().out
+    said, aside = capsys.readouterr()
+    assert "floats" not in aside
     assert "1 given to the planner" in said
     assert "motion of 5.0 s" in said
     assert said.endswith("csv: plan.csv\n")
     assert asked["config"] == dro.PlanConfig()
+
+
+def test_an_object_in_the_air_is_planned_for_and_people_are_told(
+    planned: Planned, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("pose.json").write_text(json.dumps({"frame": "world", "T_frame_object": [
+        [1, 0, 0, 0.4], [0, 1, 0, 0.2], [0, 0, 1, 0.8], [0, 0, 0, 1]]}))
+    assert planned("--pose", "pose.json") == 0
+    assert "can floats 0.7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("options", "said"), [

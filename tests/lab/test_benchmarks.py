@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,10 @@ from scipy.stats import ttest_rel
 
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.predict.config import GraspRequest
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.importing import read_foreign
-from lab.benchmarks import comparison, dexgraspbench, dexgraspbench_official
+from lab.benchmarks import dexgraspbench, dexgraspbench_official
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -88,14 +86,6 @@ def test_the_papers_form_is_trained_and_measured_once(
     found = json.loads(capsys.readouterr().out)
     assert [(r["row"], r["seed"], len(r["rows"])) for name in ("pretrained", "not pretrained") for r in found[name]] == [
         ("pretrained", 0, 3), ("not pretrained", 0, 3)]
-
-
-def test_a_row_of_the_comparison_says_candidates_and_number() -> None:
-    source, options = comparison.Source, Namespace(bundle=None, num=7)
-    rows = [source.of(name, options) for name in ("start:raw=3", "optimiser:16=2", "optimiser", "start")]
-    assert [(row.name, row.raw, row.num) for row in rows] == [
-        ("start:raw", True, 3), ("optimiser:16", False, 2), ("optimiser", False, 7), ("start", False, 7)]
-    assert [row.method.candidates for row in rows[1:3]] == [16, GraspRequest.candidates]
 
 
 def test_grasps_go_to_dexgraspbench_as_its_own_come_from_it(tmp_path: Path) -> None:

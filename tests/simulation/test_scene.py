@@ -170,6 +170,17 @@ def touched(scene: TrialScene, hand: Hand, q: torch.Tensor, place: torch.Tensor)
     return {scene.model.body(b).name.removeprefix("hand/") for b in bodies.ravel() if b != scene.object_body}
 
 
+SCENES: dict[str, TrialScene] = {}
+"""Scenes of `speck`, by the hand's hash."""
+
+
+def speck(hand: Hand) -> TrialScene:
+    """The hand and a ball too small to be in its way, built once for all tests of the hand."""
+    if hand.sha256 not in SCENES:
+        SCENES[hand.sha256] = build_scene(hand, ball(0.005), protocol("dro"))
+    return SCENES[hand.sha256]
+
+
 def deaf_links(hand: Hand) -> list[str]:
     """Links that can touch and do not notice a ball on their surface."""
     scene = build_scene(hand, ball(0.006), protocol("dro"))
@@ -185,7 +196,7 @@ def deaf_links(hand: Hand) -> list[str]:
 
 def largest_shift(hand: Hand) -> float:
     """How far links stand from where the kinematic tree has them [m], wrist joints that are held included."""
-    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    scene = speck(hand)
     q, data = hand.canonical_joints(), mujoco.MjData(scene.model)
     data.qpos[:] = scene.qpos(wrist_below(1.0), q[None])[0]
     mujoco.mj_kinematics(scene.model, data)
@@ -211,7 +222,7 @@ def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path)
     hand = loaded_hand(f"assets/{name}")
     assert deaf_links(hand) == []
     assert largest_shift(hand) < 1e-5
-    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    scene = speck(hand)
     data = mujoco.MjData(scene.model)
     target = hand.canonical_joints(0.6)
     data.qpos[:] = scene.qpos(wrist_below(1.0), hand.canonical_joints(0.9)[None])[0]
@@ -262,13 +273,13 @@ def test_fingers_collide_wherever_their_shapes_overlap(name: str, request: pytes
         request.getfixturevalue("assets_folder")
     hand = loaded_hand(name)
     assert hand.description is not None
-    scene, seen = build_scene(hand, ball(0.005), protocol("dro")), set[tuple[str, str]]()
-    drawn = hand.random_joints(100, torch.Generator().manual_seed(0))
-    for q in [hand.canonical_joints(1.0), *drawn]:
+    scene, seen = speck(hand), set[tuple[str, str]]()
+    drawn = torch.cat([hand.canonical_joints(1.0)[None], hand.random_joints(100, torch.Generator().manual_seed(0))])
+    measured = measure_penetration(scene, grasps_of(hand, scene.obj, wrist_below(1.0, len(drawn)), drawn)).own.tolist()
+    for q, own in zip(drawn, measured, strict=True):
         depths = self_penetration(hand.description, q)
         deep = finger_pairs(hand, {(min(p), max(p)) for p, depth in depths.items() if depth > 0.002})
         assert deep <= own_contacts(scene, q)
-        own = float(measure_penetration(scene, grasps_of(hand, scene.obj, wrist_below(1.0), q[None])).own[0])
         assert own >= 0.8 * sum(depth for p, depth in depths.items() if (min(p), max(p)) in deep)
         seen |= deep
     assert len(seen) > 0 or len(hand.fingers) < 3
@@ -279,7 +290,7 @@ def test_open_hands_do_not_jam(name: str, request: pytest.FixtureRequest):
     if name.startswith("assets/"):
         request.getfixturevalue("assets_folder")
     hand = loaded_hand(name)
-    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    scene = speck(hand)
     for openness in (0.75, 1.0):
         q = hand.canonical_joints(openness)
         q[[hand.tree.joint_names.index(n) for n in SPREADING.get(name, ())]] = 0.0

@@ -72,7 +72,8 @@ run_stage(stage, load_bundle(folder / "bundle.safetensors"), folder / "killed", 
 """
 
 
-@pytest.mark.parametrize(("stage", "moment"), [pytest.param("train", "before", marks=pytest.mark.slow), ("pretrain", "during")])
+@pytest.mark.slow
+@pytest.mark.parametrize(("stage", "moment"), [("train", "before"), ("pretrain", "during")])
 def test_a_killed_run_goes_on_to_the_same_curve(
     home: Path, bundle: Bundle, finished: dict[str, Path], results: dict[str, DistanceNetwork], tmp_path: Path, stage: str,
     moment: str,

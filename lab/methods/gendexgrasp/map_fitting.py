@@ -91,6 +91,7 @@ def _starts(
     return T, q
 
 
+@torch.enable_grad()  # the benchmark asks sources without gradients
 def _descend(
     hand: Hand, target: MapTarget, goals: Float[Tensor, "n m"], T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"],
     config: FittingConfig,

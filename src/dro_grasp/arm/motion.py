@@ -92,11 +92,15 @@ class MotionPlan:
     """Arm and hand over time, from home to the lifted object."""
 
     notes: PlanNotes
+    """What the plan is for, and how it came about."""
     scene: PlanScene
+    """Object, obstacles and all grasps, in the world."""
     stage: Int[np.ndarray, " k"]
     """Index into STAGES of each sample."""
     arm: Trajectory
+    """Time, position, velocity and acceleration of the arm's joints."""
     hand: Trajectory
+    """The same of the hand's independent joints, at the same times."""
 
     @property
     def seconds(self) -> float:
@@ -104,7 +108,7 @@ class MotionPlan:
         return self.arm.seconds
 
     def part(self, stage: str) -> slice:
-        """Rows of a stage, with the last row of the one before; that alone, where nothing moves and a stage has no rows."""
+        """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
         first, end = (int(np.searchsorted(self.stage, STAGES.index(stage), side)) for side in ("left", "right"))
         return slice(max(0, first - 1), end)
 
@@ -117,7 +121,7 @@ class MotionPlan:
                 np.array([np.interp(time, t.time, column) for column in t.position.T]) for t in (self.arm, self.hand)))
 
     def lines(self) -> list[str]:
-        """In words: what was dropped, what is done, how long it takes."""
+        """The plan for people: what was dropped, what is done, how long it takes."""
         n = self.notes
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])

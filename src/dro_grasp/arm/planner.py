@@ -52,23 +52,23 @@ class PlanConfig(Checked):
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
     directions: Directions = "all"
-    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    """Palm directions: `paper`, from above to the right side, or `all` for which the table leaves room."""
     constraints: Constraints = field(default_factory=Constraints)
-    """What grasps have to respect, in the world's frame; of obstacles, the arm stays clear too. The table is the robot's."""
+    """What grasps have to respect, in the world's frame. The arm stays clear of obstacles too. The table is the robot's."""
     order: Literal["score", "random"] = "score"
     """Which reachable grasps are taken: the best by score, or any, as a control."""
     rounds: int = 3
-    """How often the planner is asked, each time with the next `top` grasps."""
+    """Largest number of times that the planner is asked, each time with the next `top` grasps."""
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
+    """Grasps of each batch whose lift is simulated, on the object as it is known; 0 for none. It needs a table."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
     """How the rehearsals of one grasp deviate from what is known."""
     trusted_share: float = 0.5
     """Share of its rehearsals in which the best grasp that can be carried out should hold the object."""
     trusted_score: float = 1.0
-    """Without rehearsals: log-odds of holding that it should have."""
+    """Log-odds of holding that this grasp should have, where nothing is rehearsed."""
     batches: int = 3
-    """How often at most `num` grasps are made, while none of them is trusted, or none works."""
+    """Largest number of batches. Another is made while no grasp is trusted, or none works."""
     candidates: int = 1
     """Candidates for each grasp, as in `GraspRequest`: which of them can be reached decides more than the best scores."""
     source: str | Source = AUTO

@@ -60,8 +60,11 @@ class Robot:
     """An arm with a hand. The world's z axis points up."""
 
     name: str
+    """Name of the robot."""
     arm: Description
+    """The arm's URDF or MJCF, as read."""
     hand: Hand
+    """The hand that it carries."""
     mount_link: str
     """The arm's link that carries the hand."""
     T_link_wrist: Float[np.ndarray, "4 4"]
@@ -71,9 +74,9 @@ class Robot:
     home: Float[np.ndarray, " n_arm"]
     """Where the arm starts [rad or m]."""
     lower: Float[np.ndarray, " n_arm"]
-    """[rad or m]"""
+    """Lower limits of the arm's joints [rad or m]."""
     upper: Float[np.ndarray, " n_arm"]
-    """[rad or m]"""
+    """Upper limits [rad or m]."""
     velocity: Float[np.ndarray, " n_arm"]
     """Largest speed [rad/s or m/s]."""
     acceleration: Float[np.ndarray, " n_arm"]
@@ -85,7 +88,9 @@ class Robot:
     hand_acceleration: float
     """Largest acceleration of the hand's joints [rad/s^2 or m/s^2]."""
     camera: CameraMount | None
+    """A depth camera that stands still; None without one."""
     table: Table | None
+    """The table that objects stand on; None without one."""
 
     @property
     def arm_joints(self) -> tuple[str, ...]:
@@ -122,7 +127,7 @@ class Robot:
 
     @property
     def T_wrist_aim(self) -> Float[np.ndarray, "4 4"]:
-        """Pose in the hand's root link of the frame that is brought to its place, of few joints the grasp centre's [m]."""
+        """Pose in the hand's root link of the frame that the arm brings to its place [m]; of few joints the grasp centre's."""
         T = np.eye(4)
         if self.has_few_joints:
             T[:3, 3] = self.hand.grasp_centre_wrist.double().numpy()
@@ -130,12 +135,12 @@ class Robot:
 
     @property
     def longest_reach(self) -> float:
-        """No grasp centre gets farther from the base than this [m]: all distances between joints, and the travel of slides."""
+        """Largest distance of the grasp centre from the base [m]: all distances between joints, and the travel of slides."""
         return self._wrist_reach + float(self.hand.grasp_centre_wrist.norm())
 
     @property
     def full_reach(self) -> float:
-        """No part of arm or hand gets farther from the base than this [m]."""
+        """Largest distance of any part of arm or hand from the base [m]."""
         assert self.hand.description is not None
         limits = self.hand.tree.lower.double().numpy(), self.hand.tree.upper.double().numpy()
         return max(_farthest_surface(self.arm, *self.working_range),

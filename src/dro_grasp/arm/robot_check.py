@@ -29,7 +29,7 @@ TABLE_COLOUR: Colour = (0.90, 0.87, 0.82)  # Sand of the table
 
 @dataclass(frozen=True, eq=False)
 class RobotReport:
-    """What a check found."""
+    """Everything `dro-grasp robot check` says."""
 
     robot: Robot
     excluded: tuple[tuple[str, str], ...]
@@ -49,7 +49,7 @@ class RobotReport:
         return not self.home_contacts and self.free_share > 0
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The report for programs."""
         r = self.robot
         columns = ("home", "lower", "upper", "velocity", "acceleration", "effort")
         joints = {n: {c: float(getattr(r, c)[i]) for c in columns} for i, n in enumerate(r.arm_joints)}
@@ -60,7 +60,7 @@ class RobotReport:
                 "blocking": self.blocking, "usable": self.usable}
 
     def lines(self) -> list[str]:
-        """In words."""
+        """The report for people."""
         r = self.robot
         place = r.T_world_wrist(r.home)[:3, 3]
         of_arm = [pair for pair in self.excluded if not all(name.startswith(PREFIX) for name in pair)]
@@ -87,7 +87,10 @@ class RobotReport:
 
 
 def check_robot(name: str | Path) -> RobotReport:
-    """Load a robot and look at it.
+    """Load a robot and look for faults in its description.
+
+    Args:
+        name: A built-in robot, or a robot file.
 
     Raises:
         RobotError: The robot cannot be loaded.

@@ -60,19 +60,19 @@ class TabletopConfig(Checked):
     """How an attempt runs. Values without a source are ours."""
 
     see: Literal["cloud", "mesh"] = "cloud"
-    """What is planned for: the cloud of the robot's camera alone, or, as a control, the true mesh at its true place."""
+    """What the planner is given: the cloud of the robot's camera, or, as a control, the true mesh at its true place."""
     noise: float = 0.0015
     """Standard deviation of depth [m]."""
     region: Region = (0.38, -0.18, 0.58, 0.18)
-    """Where objects are put, from corner to corner about the arm's base [m]."""
+    """Area where objects are put: least x and y, greatest x and y, from the arm's base [m]."""
     clutter: int = 0
-    """Other objects, drawn from the built-in ones, that stand around the one that is asked for."""
+    """Number of other built-in objects that stand around the one to grasp."""
     segment: Literal["cluster", "mask"] = "cluster"
-    """How its points are told from those of others: by distance, from a place near its middle, or by its true mask."""
+    """How its points are separated from others: by distance from a place near its middle, or by the true mask."""
     hold_seconds: float = 3.0
     """How long the object is held [s]."""
     shake_seconds: float = 2.0
-    """How long it is shaken then [s]."""
+    """How long it is then shaken [s]."""
     plan: PlanConfig = field(default_factory=PlanConfig)
     """How motions are planned."""
 
@@ -128,11 +128,13 @@ class Attempt:
     robot: str
     object: str
     number: int
-    """Of the attempt with this object."""
+    """Number of the attempt with this object, from 0."""
     seed: int
+    """Seed of all draws."""
     settings: str
-    """See `TabletopConfig.label`."""
+    """Version and every setting, as `TabletopConfig.label`."""
     success: bool = False
+    """Whether the object was held to the end."""
     stage: str = "see"
     """Where it ended: see, plan, one of the motion's stages, hold, shake, or done."""
     reason: str = ""
@@ -142,7 +144,7 @@ class Attempt:
     raised: float = 0.0
     """How much higher the object was at the end than at rest [m]."""
     score: float = float("nan")
-    """Of the grasp."""
+    """Score of the grasp [log-odds of holding]."""
     grasps: int = 0
     """Grasps to choose from."""
     dropped: str = "{}"
@@ -152,25 +154,27 @@ class Attempt:
     plan_seconds: float = 0.0
     """From the cloud to the timed plan [s]."""
     grasp_seconds: float = 0.0
-    """Of these, for proposing and refining grasps [s]."""
+    """Part of `plan_seconds` for proposing and refining grasps [s]."""
     processor_seconds: float = 0.0
-    """Of one core, from the depth image to the timed plan [s]; the others are by the clock, whatever else runs."""
+    """Time of one core from the depth image to the timed plan [s]; the other times are by the clock."""
     motion_seconds: float = 0.0
     """Duration of the planned motion [s]."""
     pushed: float = 0.0
-    """Farthest that one of the other objects was moved [m]."""
+    """Largest displacement of another object [m]."""
     robot_file: str = ""
     """Name or file that the robot was loaded from."""
     object_file: str = ""
-    """The same of the object."""
+    """Name or file that the object was loaded from."""
     weights: str = ""
-    """The same of the weights."""
+    """Name or file of the weights."""
     robot_sha256: str = ""
-    """Hash of the robot, of its arm and hand; empty, as the following, where attempts are made one by one."""
+    """Hash of the robot with its arm and hand. All four hashes are empty where attempts are made one by one."""
     object_sha256: str = ""
+    """Hash of the mesh."""
     weights_sha256: str = ""
+    """Hash of the weights file."""
     solid_sha256: str = ""
-    """Hash of what was simulated of the object; one mesh may have other convex parts."""
+    """Hash of what was simulated of the object. The same mesh may be cut into other convex parts."""
 
 
 class Watcher:
@@ -375,9 +379,9 @@ class TabletopRun(Checked):
     objects: tuple[str, ...]
     """Names or files of meshes."""
     attempts: int = 10
-    """With each object. Source: paper, real-robot experiment."""
+    """Attempts with each object. Source: paper, real-robot experiment."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     weights: str | None = None
     """Name or file of weights; the shipped ones by default."""
     config: TabletopConfig = field(default_factory=TabletopConfig)

@@ -25,29 +25,29 @@ QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Evaluate grasps of several methods, before and after refinement and ranking: one table.
+    """Evaluate the grasps of several methods, before and after refinement and ranking, in one table.
 
     Example: dro-grasp benchmark --methods auto optimiser dfc my_module:MySource --hands allegro barrett --stages returned
     """
 
     methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"], metavar="NAME...", help_behavior_hint=(
         "(default: auto, start, optimiser, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
-    """What proposes the grasps: auto, network, optimiser, dfc, start, mean-grasp, mean-grasp-chosen; network@WEIGHTS and
-    auto@WEIGHTS for other weights; module:Class for a source of yours; or a grasp file."""
+    """What proposes the grasps: auto, network, optimiser, dfc, start, mean-grasp or mean-grasp-chosen; network@WEIGHTS or
+    auto@WEIGHTS for other weights; module:Class for a source of yours; PATH for a grasp file."""
     hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")  # Names or paths of hands.
     objects: tuple[str, ...] = ("builtin:test",)
     """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
     dexgraspbench: Annotated[Path | None, optional("FOLDER", "the objects above")] = None
-    """Folder of a clone of DexGraspBench, or of its archive of objects: all objects in it at the official scales take the place
-    of --objects."""
+    """Folder of a clone of DexGraspBench, or of its archive of objects. All its objects at the official scales replace
+    --objects."""
     num: int = 100  # Grasps of each hand on each object, of which ranking keeps the best quarter.
     stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
         "raw", "ranked", "refined")
-    """What is done to the grasps before the trials; of refined and of settled grasps, all and the best by score are reported.
-    settled: refined grasps after their closing was simulated. returned: what
-    `generate --source` returns. equal-time: all methods with as much CPU time for each grasp as the first."""
+    """What is done to the grasps before the trials. refined and settled report all grasps, and the best by score. settled:
+    refined grasps after their closing was simulated. returned: what `generate --source` returns. equal-time: every method
+    gets as much CPU time a grasp as the first."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
-    """Trials; displacement, rotation and diversity are means over successes of the first."""
+    """Protocols of the trials. Displacement, rotation and diversity are means over the successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights of the network.
     device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
@@ -60,7 +60,8 @@ class Benchmark:
     quick: Flag = False
     """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
-    """What methods, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
+    """What methods, refinement and ranking see: the mesh (whole), its points (cloud), half of them as in the paper (half), or
+    a depth image (depth)."""
     views: int = 1  # Views of each object for each hand, with --num grasps each.
     seed: int = 0  # The same seed gives the same grasps and views.
     json: Flag = False  # Print one JSON object instead of a Markdown table.

@@ -35,8 +35,8 @@ class Synthesize:
     """Start no new work after this time [min]. A rerun resumes."""
     workers: int = 2  # Processes of one thread each. A running Ray cluster uses all its CPUs instead.
     shard: Annotated[str, tyro.conf.arg(metavar="I/N", help_behavior_hint="(default: 1/1, all of them)")] = "1/1"
-    """Part of the pairs that this run fills: 3/16 is the third of sixteen. All parts may share the folder and run at once, as
-    the tasks of an array job."""
+    """Part of the pairs that this run fills: 3/16 is the third of sixteen. All parts may run at once and share the folder, as
+    in an array job."""
     engine: Literal["local", "ray"] = "local"  # Processes on this machine, or a Ray cluster.
     ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
     """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
@@ -45,9 +45,9 @@ class Synthesize:
     seed: int = 0  # The same seed gives the same grasps.
     protocol: ProtocolName = "strict"  # Protocol of the trial that grasps must pass.
     idle: float = 0.6
-    """Probability that a finger other than the thumb is not asked to touch, 0 to 1; lower makes fuller grasps, and fewer."""
+    """Probability, 0 to 1, that a finger other than the thumb need not touch. Lower values give fuller grasps, and fewer."""
     keep_idle_fingers: Flag = False
-    """Leave idle fingers as they are. Otherwise they close onto the object where the grasp then passes as well."""
+    """Leave idle fingers as they are. By default they close onto the object where the grasp still passes."""
     json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
@@ -120,7 +120,7 @@ class Import:
     format: Literal["cmap", "dexgraspnet", "dexgraspbench"]  # Format of the files.
     output: Path  # Folder for one grasp file per hand; created if missing.
     hands: tuple[str, ...] = ()
-    """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
+    """Names or paths of the hands. NAME_IN_FILE=NAME renames one. A file that names no hand needs exactly one."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Object of all grasps, if the file names another or none."""
     json: Flag = False  # Print one JSON object instead of a table.
@@ -227,7 +227,7 @@ class Merge(DataSets):
     Example: dro-grasp dataset merge data more --output grasps --per-pair 150
     """
 
-    output: Path  # Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end.
+    output: Path  # Folder for the files; created if missing. It holds temporary files, as large as the inputs, until the end.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     json: Flag = False  # Print one JSON object instead of a table.
@@ -338,13 +338,13 @@ class BundleCommand(DataSets):
 
     output: Path  # Bundle to write (.safetensors).
     split: Literal["train", "few_shot", "validate"] = "train"
-    """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on objects that no
-    weights are trained on, for measuring."""
+    """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on held-out objects,
+    for measuring."""
     hands: tuple[str, ...] = ()  # Hands to include; by default all.
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     hands_without_grasps: tuple[str, ...] = ()
-    """Names or URDF files of further hands, such as those of `hand make`: `pretrain` needs their kinematics alone."""
+    """Names or URDF files of further hands, such as those of `hand make`. `pretrain` uses their kinematics."""
     json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:

@@ -32,18 +32,18 @@ class Evaluate:
     """
 
     file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.
-    protocol: ProtocolName = DEFAULT_PROTOCOL  # The trial.
+    protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial.
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Mesh to use, likewise, for a file with one object."""
+    """Mesh to use instead of the one named in the file, for a file with one object."""
     scale: float = 1.0  # Scale of the mesh given with --object.
     contact_quality: Flag = False
-    """Also measure penetration, contact distance and force closure of the grasps as they are, without any motion: the analytic
-    metrics of DexGraspBench, with the protocol's friction."""
+    """Also measure the analytic metrics of DexGraspBench, with the protocol's friction: penetration, contact distance and
+    force closure of the grasps as they are, without any motion."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
-    """Save the grasps with their results, which must be those of the hand and the object that they were made for."""
+    """Save the grasps with their results. Hand and object must be those that the grasps were made for."""
     json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:

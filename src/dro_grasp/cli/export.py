@@ -30,11 +30,11 @@ class Export:
         help=" ".join(f"{name}: {form.explanation}." for name, form in FORMATS.items()))]
     output: Path  # File to write. For dexgraspbench and for several objects: a folder, created if missing.
     frame: Annotated[Path | None, optional("JSON", "the object's frame")] = None
-    """File with {"frame": "camera", "T_frame_object": 4x4}, the frame for the exported poses."""
+    """File with {"frame": "camera", "T_frame_object": 4x4}: the frame of the exported poses."""
     only_successful: Flag = False  # Export only grasps that passed their trial.
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object to use instead, if pregrasps are missing, for a file with one object."""
+    """Object to use instead of the one named in the file, for a file with one object. Needed only to make pregrasps."""
     json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:

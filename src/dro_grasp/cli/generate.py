@@ -38,25 +38,24 @@ class Generate:
     hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.
     object: str  # An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them.
     num: int = 16  # How many grasps of each object.
-    candidates: int = 4  # Candidates proposed for each grasp kept; the best by score are kept. 1 is quickest.
+    candidates: int = 4  # Candidates for each grasp; the best by score are kept. 1 is quickest.
     seed: int = 0  # The same seed gives the same grasps.
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
     """In the object's frame, or in the one that --camera names."""
     table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; the whole hand stays above it."""
     obstacles: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
-    """Mesh or cloud of what stands around the object, in its frame and unit and without it. The hand stays clear of it: open,
-    10 cm back; straight from there in pregrasp; in grasp and squeeze."""
+    """Mesh or cloud of what stands around the object, without the object itself, in the same frame and unit. The hand stays
+    clear of it: open and 10 cm back, on the straight way from there in pregrasp, in grasp and in squeeze."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
-    """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
-    direction and table are in the named frame."""
+    """File with {"frame": "base", "T_frame_camera": 4x4}. The object is then a cloud in the camera's frame, which is cleaned.
+    Grasps, --direction and --table are in the named frame."""
     source: str = "auto"
-    """What proposes candidates: network; optimiser, which also makes training data (any hand, nothing learned); auto, the
-    network, and the optimiser for the grasps with which the score does not trust it; module:Class, a source of yours; or a
-    grasp file."""
+    """What proposes candidates. network: the weights. optimiser: geometry alone, for any hand. auto: the network, and the
+    optimiser for grasps that the score does not trust. module:Class: a source of yours. PATH: a grasp file."""
     refine: bool = True  # Refine the candidates on the object's geometry, near where the network proposed them.
     keep_table: Flag = False
-    """Take every point of a cloud for the object's. By default a table in it is found and cut off, and hands stay above it."""
+    """Keep every point of a cloud. By default a table in it is found and cut off, and hands stay above it."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
     scale: float = 1.0  # Multiplies the object's coordinates; 0.001 for files in millimetres.
@@ -69,11 +68,11 @@ class Generate:
     ] = None
     """Trial of each grasp."""
     only_successful: Flag = False
-    """Save, draw and view only the successful grasps; the success rate still counts all that were asked for."""
+    """Save, draw and view only successful grasps. The success rate still counts all that were asked for."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
-    """Parquet file for the grasps; with a folder of objects, an existing folder that gets one file an object."""
+    """Parquet file for the grasps. With a folder of objects: an existing folder, for one file an object."""
     picture: Annotated[Path | None, optional("PNG", "no picture")] = None
-    """Picture of the best grasps; with a folder of objects, an existing folder."""
+    """Picture of the best grasps. With a folder of objects: an existing folder, for one picture an object."""
     view: Flag = False  # Open the viewer on the result.
     json: Flag = False  # Print one JSON object instead of a table.
 

@@ -31,9 +31,9 @@ class PalmOptions:
     """Where palms point, and how far hands open."""
 
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
-    """Palm direction: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand needs room."""
+    """Palm direction: 0 0 -1 grasps from above. Over a table, palms also tilt down as far as the hand needs room."""
     max_tilt: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
-    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
+    """Largest angle [rad] between the palm direction and --direction. Palms are spread evenly within it."""
     pregrasp_clearance: Annotated[float | None, optional("M", "a quarter of what is left")] = None
     """Least distance [m] between the object and every link that closes, in pregrasp."""
 
@@ -49,5 +49,5 @@ class ConstraintOptions(PalmOptions):
     """Where palms point, how far hands open, and where they touch."""
 
     contact_region: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
-    """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
+    """Balls [m], four numbers each. In the grasp the hand touches the object only inside them."""
     keep_out: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()  # Balls [m] that the hand stays out of.

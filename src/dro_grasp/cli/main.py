@@ -31,8 +31,8 @@ DONE = 0  # Exit code of a command that succeeded
 FAILED = 1  # Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`
 BAD_INPUT = 2  # Exit code after invalid input
 WAIT_POLICY = ("OMP_WAIT_POLICY", "PASSIVE")
-"""Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
-programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
+"""Environment variable that lets PyTorch's threads sleep while they wait; otherwise they spin, which slows down everything on
+a busy machine. It counts if it is set before PyTorch is loaded."""
 THREADS = "OMP_NUM_THREADS"  # Environment variable of the number of threads, for which the same holds
 
 named = tyro.conf.subcommand

@@ -24,10 +24,10 @@ class Onboard:
     objects: tuple[str, ...] = ("builtin:train",)  # Objects to synthesize grasps of: names, meshes, folders or groups.
     held_out: tuple[str, ...] = ("builtin:test",)  # Objects to evaluate the weights on, never used in training.
     minutes: float = 30.0  # Total time for data, training and trials [min].
-    num: int = 20  # Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns.
+    num: int = 20  # Grasps of the network evaluated on each held-out object; of what `generate` returns, a quarter as many.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights to fine-tune.
     source: str = "auto"
-    """Source of the grasps that `generate` returns in benchmarks and report: as `generate --source`."""
+    """Source of the returned grasps in benchmarks and report, as `generate --source`."""
     device: str = "cpu"
     """Device for the network, its training and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     workers: int = 2  # Processes that synthesize grasps.

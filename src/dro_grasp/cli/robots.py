@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from dro_grasp.arm.tabletop import Attempt
 
 
+FLOATS = 0.1
+"""Height above the table from which on an object is said to float [m] (ours): of a bulge a camera sees no lower part."""
+
+
 @dataclass(frozen=True)
 class Plan:
-    """Plan how a robot grasps an object and lifts it: what a robot's computer runs. Needs the extra `[arm]`.
+    """Plan the motion with which a robot grasps an object and lifts it. Needs the extra `[arm]`.
 
     Example: dro-grasp plan --robot xarm7_leaphand --object mug --at 0.5 0.1 --output plan.npz --trajectory plan.yaml
     """
@@ -34,30 +38,31 @@ class Plan:
     robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
     object: str
     """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may
-    show the table and other things too."""
+    also show the table and other things."""
     camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
-    """The object is a cloud in this camera's frame; it is cleaned and completed. A file with {"frame": "world",
-    "T_frame_camera": 4x4}, or `robot` for the camera of the robot file."""
+    """File with {"frame": "world", "T_frame_camera": 4x4}, or `robot` for the camera of the robot file. The object is then a
+    cloud in the camera's frame, which is cleaned and completed."""
     pose: Annotated[Path | None, optional("JSON", "the object's frame is the world frame")] = None
     """File with {"frame": "world", "T_frame_object": 4x4}: where the object stands."""
     at: Annotated[tuple[float, float] | None, optional("X Y", "as --pose says")] = None
-    """Stand the object, upright in its own frame, on the table at this place [m]."""
+    """Put the object on the table at this place [m], upright as in its own frame."""
     near: Annotated[tuple[float, float] | None, optional("X Y", "there is only one")] = None
-    """The object is a cloud of a table with several things: take the one nearest to this place in the world [m], and keep clear
-    of the others."""
+    """Place in the world [m]. The object is then the nearest thing in a cloud of a table with several, and the motion keeps
+    clear of the others."""
     obstacles: tuple[str, ...] = ()  # Clouds and meshes of things, in the world frame, that nothing may touch.
     scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
-    """Mesh or cloud of what stands around, of any size, in the world frame and without object and robot: hand and arm stay
-    clear of it."""
+    """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
+    of it."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
-    top: int = 5  # Reachable grasps of best score that are given to the planner at once.
+    top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
+    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none. A robot
+    without a table has none."""
     directions: Literal["paper", "all"] = "all"
-    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     planner_seconds: float = 3.0  # Longest time for one path [s].
-    seed: int = 0  # Of grasps, inverse kinematics and planner.
+    seed: int = 0  # Seed of grasps, inverse kinematics and planner.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     output: Annotated[Path | None, optional("NPZ", "not saved")] = None
@@ -99,6 +104,10 @@ class Plan:
         if robot.table is None:
             say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
                       "`table` in the robot file")
+        lowest = float((obj.cloud @ T_world_object[2, :3]).min() + T_world_object[2, 3])
+        if robot.table is not None and lowest > robot.table.height + FLOATS:
+            say_aside(f"{obj.name} floats {lowest - robot.table.height:.2f} m above the table; if nothing holds it there, "
+                      "say where it is (--camera, --pose, --at)")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
@@ -182,33 +191,33 @@ class Tabletop:
 
     robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
     objects: tuple[str, ...]  # Names or files of meshes, `all`, or `assets:validate`.
-    attempts: int = 10  # With each object, each at another place and in another pose.
+    attempts: int = 10  # Attempts with each object, each at another place and in another pose.
     see: Literal["cloud", "mesh"] = "cloud"
-    """What is planned for: the robot's camera's cloud alone, or, as a control, the true mesh at its true place."""
-    order: Literal["score", "random"] = "score"  # Which reachable grasps are taken: the best by score, or, as a control, any.
-    directions: Literal["paper", "all"] = "all"  # Palm directions: `paper`, from above to the right side, or `all`.
+    """What the planner is given: the cloud of the robot's camera, or, as a control, the true mesh at its true place."""
+    order: Literal["score", "random"] = "score"  # Reachable grasps to take: the best by score, or, as a control, any.
+    directions: Literal["paper", "all"] = "all"  # Palm directions: paper, from above to the right side, or all.
     constraints: PalmOptions = field(default_factory=PalmOptions)  # In the world frame.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
     region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
-    """Where objects are put, from corner to corner about the arm's base [m]; a small arm needs them nearer."""
+    """Two corners of the area where objects are put, from the arm's base [m]. A small arm needs a nearer one."""
     clutter: int = 0
-    """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
+    """Number of other built-in objects that stand around the one to grasp: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
-    """How the object's points are told from those of others: by distance, or by its true mask."""
+    """How the object's points are separated from others: by distance (cluster), or by the true mask."""
     noise: float = 0.0015  # Standard deviation of the camera's depth [m].
-    seed: int = 0  # Of all draws.
+    seed: int = 0  # Seed of all draws.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     workers: int = 1  # Processes; each takes one object after the other.
     output: Annotated[Path | None, optional("PARQUET", "not saved")] = None
-    """A row for each attempt, with stage, reason, times and seed. Attempts that it holds with the same robot, objects, weights,
-    settings and seed are not repeated."""
+    """File for a row an attempt, with stage, reason, times and seed. A rerun repeats no attempt that it holds with the same
+    robot, object, weights, settings and seed."""
     plans: Annotated[Path | None, optional("FOLDER", "not saved")] = None
     """Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz."""
     video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None
-    """Animation of the first attempt, which is run once more for it."""
+    """Animation of the first attempt, which runs once more for it."""
     json: Flag = False  # Print one JSON object instead of text.
 
     def run(self, make: Callable[..., Attempt] | None = None) -> int:
@@ -271,7 +280,7 @@ def _say(attempt: Attempt) -> None:
 
 @dataclass(frozen=True)
 class CheckRobot:
-    """Check a robot description: chains, limits, reach, what collides; and draw it.
+    """Check a robot description: its chains, limits, reach and collisions; and draw it.
 
     Example: dro-grasp robot check robot.yaml --picture robot.png
     """
@@ -297,7 +306,7 @@ class CheckRobot:
 
 @dataclass(frozen=True)
 class Robots:
-    """List the built-in robots. Any other is a robot file."""
+    """List the built-in robots. Any robot file works as well."""
 
     json: Flag = False  # Print one JSON object.
 

@@ -28,13 +28,13 @@ class Stage:
         Literal["slim", "paper", "paper-slim", "multi"] | None,
         tyro.conf.arg(metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: multi)"),
     ] = None
-    """Network: multi, or slim (that of the default weights: narrow, told the placement), paper, or paper-slim (the paper's,
-    as narrow)."""
+    """Form of the network. multi, also called slim: that of the default weights, narrow, with a placement. paper: the paper's.
+    paper-slim: the paper's, as narrow as multi."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
-    """Weights to begin with. They decide the network; `train` keeps their hand encoder as it is."""
+    """Weights to start from, which decide the form of the network. `train` keeps their hand encoder as it is."""
     learning_rate: float = 1e-3  # Peak of the learning rate.
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit (of each part of pretraining); the learning rate follows steps or time, whichever is further on."""
+    """Time limit [min]; in `pretrain`, of each part. The learning rate follows steps or time, whichever is further on."""
     shards: int = 1  # Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them.
     tensorboard: Flag = False  # Also write the log for TensorBoard, which must be installed.
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
@@ -82,7 +82,7 @@ class Pretrain(Stage):
 
     steps: int = 3000  # Optimiser steps.
     motion_steps: int = 5000
-    """Optimiser steps of the motion, which is learned after the encoder, in its own folder in the run folder."""
+    """Optimiser steps of the motion, which is learned after the encoder, in a folder of its own in the run folder."""
 
     def run(self) -> int:
         """Pretrain, save, and report the matching rank."""
@@ -138,10 +138,10 @@ class Train(Stage):
     """
 
     part: Literal["all", "placement"] = "all"
-    """placement: train the placement prior of --initial further, alone: it shares nothing with the rest, and wants more
-    grasps (steps of 96, hands by the square root of their grasps). Options of losses, samples and columns do not apply."""
+    """placement: train only the placement prior of --initial, which shares no parameters with the rest. A step takes 96 grasps,
+    of hands in proportion to the square root of their number of grasps. Options of losses, samples and columns do not apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
-    """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
+    """Weights from `dro-grasp pretrain`. Without them, and without --initial, the hand encoder is trained too."""
     steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None  # Optimiser steps.
     losses: Literal["ours", "release"] = "ours"
     """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
@@ -149,12 +149,12 @@ class Train(Stage):
     """KL weight; a lower value lets z carry more information."""
     samples_per_hand: int = 4  # Grasps of each of the four hands in a shard.
     by_count: float = 0.0
-    """Draw hands in proportion to the number of their grasps to this power; 0: each as often as any other."""
+    """Power of the number of grasps with which hands are drawn; 0 draws all hands equally often."""
     columns: int = 48  # Object points to which a step predicts distances; a GPU affords 128.
     mixed: Flag = False  # Multiply in bfloat16 in encoders and transformers; for GPUs.
     partial: float = 0.0  # Share of samples with half of the object cut away.
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
-    """Bundle of grasps that are not trained on; the weights' distance errors on them are reported in the end."""
+    """Bundle of grasps that are not trained on. The distance errors on them are reported at the end."""
     validation_samples: int = 400  # Validation grasps of each hand.
 
     def run(self) -> int:

@@ -39,15 +39,15 @@ class View:
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
-    """Object to show first: a name in the file, or a mesh to use for the file's only object; without a file, any object."""
+    """Object to show first: a name in the file, or a mesh to use for the file's only object. Without a file: any object."""
     scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
     port: int = 8080  # Port to serve on; if it is taken, the next free one.
     host: str = "127.0.0.1"  # Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network.
-    attempt: int = 0  # Which of the attempts in the file to run once more and show first.
+    attempt: int = 0  # Number of the attempt in the file to run again and show first.
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Robot to use instead of the one named in a plan or an attempt."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights, or the attempts' own")] = None
-    """Weights for grasps generated on the page, or to use instead of those that attempts were made with."""
+    """Weights for grasps generated on the page, or to use instead of those of the attempts."""
     device: str = "cpu"  # Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1.
 
     def run(self, show: Callable[[ServedPage], None] | None = None) -> int:
@@ -185,21 +185,21 @@ TOKEN = "DRO_GRASP_TOKEN"  # Environment variable of the token, which others can
 
 @dataclass(frozen=True)
 class Serve:
-    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `[apps]`.
+    """Answer requests for grasps over HTTP, without the start-up time of a command. Needs the extra `[apps]`.
 
     Example: dro-grasp serve --hand my_hand.urdf --port 8090
     """
 
-    hand: tuple[str, ...] = ()  # Names or files of hands that are loaded at once; built-in ones can be asked for besides.
+    hand: tuple[str, ...] = ()  # Names or files of hands to load at the start. Requests can name built-in hands as well.
     object: tuple[str, ...] = ()
-    """Files or folders of objects that can be asked for by their names; built-in ones, and what is sent, can be besides."""
+    """Files or folders of objects that requests can name. Requests can also name built-in objects, or send their own."""
     host: str = "127.0.0.1"
     """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network and needs a token."""
     port: int = 8090  # Port to serve on.
     token: Annotated[str | None, optional("TOKEN", "DRO_GRASP_TOKEN, or none")] = None
-    """What requests must bear: the header `Authorization: Bearer TOKEN`."""
+    """Token that requests must carry, in the header `Authorization: Bearer TOKEN`."""
     queue: int = 16  # Requests that may wait; more are refused.
-    time_limit: float = 60.0  # A request that is computed for longer is ended [s].
+    time_limit: float = 60.0  # Longest computation of one request [s]; a longer one is ended.
     megabytes: float = 32.0  # Largest request [MB].
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights or the path of a weights file."""

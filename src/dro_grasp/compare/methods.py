@@ -27,7 +27,7 @@ class MethodOptions(Checked):
     weights: str | None = None
     """Name or path of weights; the shipped ones if omitted."""
     device: str = "cpu"
-    """Where networks run."""
+    """Device on which networks run."""
     temperature: float | None = None
     """Spread of z of the D(R,O) network."""
     bundle: Any = None  # its class is of training, a wing above this one

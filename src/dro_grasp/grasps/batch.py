@@ -64,15 +64,15 @@ class GraspBatch:
     provenance: tuple[str, ...]
     """How each grasp was made, with model and version."""
     pregrasp_joints: Float[Tensor, "n n_dof"]
-    """Opened joints from which the hand closes; a row of NaN is not stated, and `controller.complete` makes it."""
+    """Opened joints from which the hand closes [rad or m]; a row of NaN is not stated, and `complete` makes it."""
     squeeze_joints: Float[Tensor, "n n_dof"]
-    """Joint targets that press on the object; likewise."""
+    """Joint targets that press on the object [rad or m]; a row of NaN is not stated."""
     score: Float[Tensor, " n"]
     """Predicted log-odds that the grasp holds; higher is better."""
     energy: Float[Tensor, " n"]
     """Grasp energy; lower is better."""
     trial_success: Bool[Tensor, " n"]
-    """What `success` returns; also there while no grasp has been evaluated, and then False."""
+    """What `success` returns; False for all while no grasp has been evaluated."""
     displacement: Float[Tensor, " n"]
     """Largest displacement of the object in the trial [m]."""
     rotation: Float[Tensor, " n"]
@@ -101,14 +101,14 @@ class GraspBatch:
     ) -> GraspBatch:
         """A batch for a hand and one or several objects.
 
+        Numbers may be arrays or lists in any precision; they become single.
+
         Args:
             hand: The hand: name, sha256 and tree are recorded.
             obj: The object or one object per grasp: name, sha256 and split are recorded.
             T_object_wrist: Wrist poses in the object's frame, (n, 4, 4) [m].
             joints: Independent joints, (n, n_dof) [rad or m].
             optional: Any other field of GraspBatch; `seed` may be one int, `provenance` one string.
-
-        Numbers may be arrays or lists; those in any precision become single.
 
         Raises:
             OptionError: A column has another shape, poses or joints are not finite, or a pose is no rigid motion.

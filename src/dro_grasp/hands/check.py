@@ -71,6 +71,9 @@ class HandReport:
 def check_hand(name: str | Path) -> HandReport:
     """Derive a hand and look for faults in its description.
 
+    Args:
+        name: A hand's name or file, as for `load_hand`.
+
     Raises:
         HandError: The description cannot be used at all.
     """

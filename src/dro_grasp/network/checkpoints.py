@@ -42,6 +42,9 @@ def save_weights(
         network: A network that predicts grasps, whose configuration goes along, or a small one that ships beside it.
         about: How the weights were made, and on what data.
         history: The same of the weights that training began with, oldest first (`history_of`).
+
+    Raises:
+        OutputError: The path cannot be written.
     """
     path = given_path(path)
     tensors = {

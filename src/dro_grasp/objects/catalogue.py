@@ -44,8 +44,8 @@ def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = 
             trimesh mesh, cloud or scene, a pair (vertices, faces), or points (n 3), with normals (n 6).
         scale: Multiplies all coordinates; 0.001 for millimetres.
         name: What to call the object, instead of its own name.
-        keep_table: Take every point of a bare cloud for the object's. By default a table in it is found and cut off, said in a
-            note, and hands stay above it.
+        keep_table: Keep every point of a bare cloud. By default a table in it is found and cut off, with a note, and hands
+            stay above it.
 
     Raises:
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.

@@ -34,6 +34,7 @@ class Scene:
     """A mesh, or a cloud of points, in the frame of an object."""
 
     name: str
+    """Name, for messages."""
     points: Float[np.ndarray, "n 3"]
     """Vertices, or points of the cloud [m]."""
     faces: Int[np.ndarray, "m 3"] | None = None
@@ -44,7 +45,7 @@ class Scene:
         return f"Scene('{self.name}', {made})"
 
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Scene:
-        """The same in another frame."""
+        """The same in another frame; T takes its coordinates there [m]."""
         return Scene(self.name, trimesh.transform_points(self.points, T), self.faces)
 
     def near(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> DistanceField | None:

@@ -33,6 +33,7 @@ class ObjectModel:
     """An object in its mesh's frame."""
 
     name: str
+    """Name of the object."""
     cloud: Float[np.ndarray, "k 3"]
     """Surface points in single precision [m]."""
     cloud_normals: Float[np.ndarray, "k 3"]
@@ -73,12 +74,12 @@ class ObjectModel:
 
     @property
     def is_cloud(self) -> bool:
-        """Whether there is no mesh."""
+        """Whether this is a bare cloud, without a mesh."""
         return self.vertices is None
 
     @property
     def mass(self) -> float:
-        """Mass at DENSITY [kg]."""
+        """Mass at a density of 500 kg/m^3 [kg]."""
         return DENSITY * self.volume
 
     @property

@@ -42,8 +42,9 @@ class ClosingConfig(Checked):
     rest_shares: tuple[float, ...] = (1.0, 0.7, 0.4)
     """Shares of the way to the bend of the fingers that hold; an idle finger rests at the first at which it has room."""
     overlap: float = 0.001
-    """Most that the self-penetration of a grasp may grow [m]."""
+    """Largest growth of a grasp's self-penetration [m]."""
     batch_size: int = 64
+    """Grasps closed at once."""
 
 
 @torch.no_grad()

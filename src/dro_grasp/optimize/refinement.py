@@ -26,6 +26,7 @@ class RefineConfig(Checked):
     """Steps of the descent, and how far a grasp may move (ours)."""
 
     steps: int = 40
+    """Steps of the descent."""
     farthest: float = 0.02
     """Largest displacement of the grasp centre [m]."""
     largest_turn: float = math.radians(15)
@@ -43,14 +44,16 @@ class RefineConfig(Checked):
     growth: float = 1.2
     """Factor on a grasp's step lengths after a step that lowered its energy."""
     shrinkage: float = 0.5
-    """The same after a step that did not, which is undone."""
+    """Factor after a step that did not, which is undone."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(
         penetration=500.0, self_penetration=500.0, hand_points=400, filled=True, clearance=500.0, clearance_points=512))
     """Weights; no simulation settles these grasps, so penetration weighs more than in synthesis."""
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """How idle fingers close before the descent."""
     grip: GripConfig = field(default_factory=GripConfig)
+    """How the squeeze is made after it."""
     batch_size: int = 32
+    """Grasps refined at once."""
 
 
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:

@@ -30,14 +30,15 @@ class GripConfig(Checked):
     reach: float = 0.006
     """Links nearer than this to the object are taken to touch it [m]."""
     contacts: int = 12
-    """Most links that touch; the nearest ones."""
+    """Largest number of links that touch; the nearest are taken."""
     friction: float = 0.4
-    """Coefficient of friction that the forces rely on; less than there will be."""
+    """Coefficient of friction that the forces rely on, below that of trials."""
     edges: int = 6
+    """Edges of a friction cone."""
     force: float = 10.0
     """Sum of the normal forces [N]."""
     stiffness: float = 3.0
-    """Stiffness of the servos [Nm/rad]; a squeeze is the force over it."""
+    """Stiffness of the servos [Nm/rad]: a joint torque over it is the offset of the target."""
     sharing: float = 0.05
     """Weight of equal shares of the fingers in the force, beside the net wrench."""
     smoothness: float = 1e-3
@@ -47,7 +48,9 @@ class GripConfig(Checked):
     idle: float = 0.7
     """The same for fingers that do not touch, and for those that share their joints."""
     iterations: int = 200
+    """Steps of the solver of forces."""
     batch_size: int = 64
+    """Grasps solved at once."""
 
 
 @torch.no_grad()

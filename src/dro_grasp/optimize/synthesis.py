@@ -49,12 +49,15 @@ class SynthesisConfig(Checked):
     temperature: float = 1.0
     """Energy increase accepted with probability 1/e at the start; falls to `last_temperature`."""
     last_temperature: float = 0.02
-    """The same at the end."""
+    """The temperature at the end."""
     device: str = "cpu"
     """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(filled=True))
+    """Weights of the energy's terms."""
     starts: StartConfig = field(default_factory=StartConfig)
+    """Where hands start."""
     contacts: ContactConfig = field(default_factory=ContactConfig)
+    """Which links touch."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,12 @@ class State(Rows):
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesize grasps of an object by a hand, lowest energy first, not evaluated.
 
-    The same seed gives the same grasps.
+    Args:
+        hand: Any hand.
+        obj: An object with a mesh.
+        num: Grasps to return.
+        seed: The same seed gives the same grasps.
+        config: The optimiser.
 
     Raises:
         OptionError: `num` is not positive.

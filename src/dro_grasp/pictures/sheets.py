@@ -50,7 +50,7 @@ class PictureStyle(Checked):
     opacity: float = 1.0
     """Opacity of the object; below 1 the hand shows through it."""
     contacts: bool = False
-    """Mark contacts in red, even where something hides them."""
+    """Mark contacts in red, hidden ones too."""
     posture: Literal["held", "grasp"] = "held"
     """Hand and object after the hand has closed in a trial, or the grasp itself, which closing starts from; `draw_grasp` draws
     the joints and poses that it is given."""

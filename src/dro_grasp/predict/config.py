@@ -28,10 +28,9 @@ class GraspRequest(Checked):
     refine: bool = True
     """Refine and settle the candidates on the object's geometry before they are ranked."""
     temperature: float | None = None
-    """Spread of z; None takes the predictor's."""
+    """Spread of z, from 0 to 2; None takes the predictor's."""
     source: str | Source = AUTO
-    """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source.
-    One that no predictor makes is made at once."""
+    """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done, before any work.
@@ -60,11 +59,11 @@ class RetryConfig(Checked):
     """How often a source is asked again when constraints reject its candidates (ours)."""
 
     rounds: int = 4
-    """How often at most it is asked in all."""
+    """Largest number of times that it is asked."""
     least_yield: float = 0.2
-    """Share of the candidates up to which it is not asked again."""
+    """It is not asked again if no larger share of its candidates was admitted."""
     reserve: float = 1.5
-    """How many times as many candidates it is asked for again as the share that was rejected suggests."""
+    """Factor on the number of candidates that the admitted share suggests for the next call."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +75,9 @@ class RescueConfig(Checked):
     per_grasp: int = 8
     """Candidates in a round for each grasp that needs rivals."""
     trusted_in_surroundings: tuple[float, ...] = (1.5, 0.5)
-    """The scores where a descent also watches surroundings, which takes twice as long."""
+    """Trusted scores where there are surroundings, with which a descent takes longer."""
     per_grasp_in_surroundings: int = 4
-    """The candidates there; as many of the grasps hold."""
+    """Candidates in a round where there are surroundings."""
 
     def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""

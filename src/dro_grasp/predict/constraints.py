@@ -40,7 +40,7 @@ class Constraints(Checked):
     """
 
     direction: Direction | None = None
-    """Palm direction; any by default. Over a table, palms tilt towards it as far as the hand needs room."""
+    """Palm direction; any by default. Over a table, palms also tilt down as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
     max_tilt: float | None = None
@@ -54,8 +54,8 @@ class Constraints(Checked):
     keep_out: tuple[Ball, ...] = ()
     """Keep-out, as balls (x, y, z, radius) [m] that the hand stays out of."""
     pregrasp_clearance: float | None = None
-    """Least distance between the object and every link that closes, in pregrasp [m]: by so much may hand and object be off
-    their places. The pregrasp opens as far as that takes. By default it opens by a quarter of what is left."""
+    """Least distance between the object and every link that closes, in pregrasp [m]: the error of place that the approach
+    tolerates. The pregrasp opens as far as that takes. By default joints open by a quarter of the range left."""
 
     def __repr__(self) -> str:
         given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
@@ -135,7 +135,7 @@ class Constraints(Checked):
             self.obstacles.require_apart(obj)
 
     def warning(self, obj: ObjectModel) -> str | None:
-        """What is odd about the table, in words; None for nothing."""
+        """A sentence about a table that contradicts the cloud's own; None if there is none."""
         if self.table is None or obj.table is None:
             return None
         found, centre = torch.tensor(obj.table), torch.tensor(obj.centre_of_mass)

@@ -51,7 +51,9 @@ class Finished:
     """Candidates after all stages, and the best of them."""
 
     problem: GraspProblem
+    """Hand, object and constraints."""
     config: FinishConfig
+    """The stages."""
     keep: int
     """Grasps that are wanted."""
     pool: GraspBatch
@@ -74,7 +76,7 @@ class Finished:
 
     @cached_property
     def grasps(self) -> GraspBatch:
-        """The best, as they are given away."""
+        """The best, complete and eased, as they are returned."""
         best = self.pool[self.rows]
         return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
 
@@ -100,6 +102,9 @@ def finish(
         config: The stages.
         keep: Grasps that are wanted.
         rivals: Finished candidates of earlier calls, which stay in the choice.
+
+    Raises:
+        GraspFileError: The candidates are of another hand.
     """
     config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
     with watch("refine"):

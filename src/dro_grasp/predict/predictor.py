@@ -111,9 +111,20 @@ class GraspPredictor:
             obj: A mesh or a bare point cloud.
             num: Grasps to return.
             seed: The same seed gives the same grasps.
-            constraints: What grasps have to respect; the fields of `Constraints` that are given by name replace its own.
-            direction: Field of `Constraints`, as all up to `pregrasp_clearance`.
-            candidates: Field of `GraspRequest`, as `refine`, `temperature` and `source`.
+            constraints: What grasps have to respect, in the object's frame. The keywords from `direction` to
+                `pregrasp_clearance` replace its fields.
+            direction: Palm direction; (0, 0, -1) grasps from above.
+            max_tilt: Largest angle between the palm direction and `direction` [rad].
+            table: Height of a table [m]; the hand stays above it.
+            obstacles: What else the hand stays clear of; see `load_scene`.
+            contact_region: Balls (x, y, z, radius) in which the hand may touch the object [m].
+            keep_out: Balls (x, y, z, radius) that the hand stays out of [m].
+            pregrasp_clearance: Least distance in pregrasp between the object and every link that closes [m].
+            candidates: Candidates for each grasp; the best by score are returned.
+            refine: Refine and settle the candidates before they are ranked.
+            temperature: Spread of z: 0 for the likeliest grasps, 1 for the diversity of the training grasps; None takes the
+                predictor's.
+            source: What proposes: `auto`, `network`, `optimiser`, another name that `make_source` knows, or a source.
 
         Raises:
             ObjectError: The obstacles contain the object.

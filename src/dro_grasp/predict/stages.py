@@ -43,6 +43,9 @@ def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | Non
         problem: Hand and object.
         grasps: Any grasps of the two; outcomes, scores, energies and what they state of pregrasp and squeeze are dropped.
         config: Steps, bounds and forces.
+
+    Raises:
+        GraspFileError: The grasps are of another hand.
     """
     config, max_tilt = config or RefineConfig(), problem.constraints.max_tilt
     grasps.require_hand(problem.hand)
@@ -89,6 +92,9 @@ def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None =
         problem: Hand and object.
         grasps: Any grasps of the two.
         config: What the score is.
+
+    Raises:
+        GraspFileError: The grasps are of another hand.
     """
     return scored(problem, grasps, config).sorted_by_score()
 
@@ -116,6 +122,7 @@ def evaluate(
 
     Raises:
         ObjectError: The object is a bare cloud.
+        GraspFileError: The grasps are of another hand.
         OptionError: No protocol has the name.
     """
     return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))

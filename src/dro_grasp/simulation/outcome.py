@@ -46,6 +46,7 @@ class TrialResult:
     """
 
     success: Bool[Tensor, " n"]
+    """Whether each grasp holds."""
     displacement: Float[Tensor, "n 6"]
     """Displacement of the object's centre of mass after each force, relative to its place after closing, or to that in the
     labelled grasp under a protocol that resets it [m]; a lost object keeps its last value."""
@@ -68,10 +69,11 @@ class TrialResult:
     reason: tuple[str, ...]
     """The same in words, with the number or the direction; empty for a success."""
     robustness: Float[Tensor, " n"]
-    """Share of its trials that a grasp holds in; NaN under a protocol that does not perturb."""
+    """Share of its trials in which a grasp holds; NaN under a protocol that does not perturb."""
     shown: Int[Tensor, " n"]
     """The trial that was measured; 0 is the protocol's own, without perturbation."""
     protocol: str
+    """Name and version of the protocol, as `Protocol.label`."""
     asked: int | None = None
     """How many grasps were asked for, as `GraspBatch.asked`."""
 

@@ -24,8 +24,9 @@ class Perturbations(Checked):
     """
 
     trials: int = 1
+    """Trials of each grasp."""
     needed: int = 1
-    """Trials that a success holds in."""
+    """Trials in which a success must hold."""
     coarse: int = 0
     """Trials, the last ones, in which the object collides as its coarse parts."""
     shift: float = 0.0
@@ -56,6 +57,7 @@ class Protocol(Checked):
     """How a trial runs and when it counts as a success."""
 
     name: str
+    """Name, as stored with outcomes: letters, digits, `_`, `-` and `.`."""
     version: int = 1
     """Goes up with every change that can change a verdict."""
     closing: bool = True
@@ -69,11 +71,11 @@ class Protocol(Checked):
     mass_factor: float = 1.0
     """Multiplies the object's mass and with it the disturbing forces."""
     torsional_friction: float = 0.02
-    """[m]"""
+    """Torsional friction between hand and object [m]."""
     force: float = 0.5
     """Disturbing force per object mass [m/s^2]. Source: paper, evaluation metric details."""
     closing_time: float = 1.0
-    """[s]"""
+    """Time in which the hand closes [s]."""
     gradual: bool = False
     """Move the targets from the pregrasp to the grasp and on to the squeeze, each in half of the closing time; otherwise
     the squeeze is the target from the start."""
@@ -84,29 +86,29 @@ class Protocol(Checked):
     force_time: float = 1.0
     """Duration of the force along each of +x +y +z -x -y -z of the object's frame [s]."""
     max_displacement: float = 0.02
-    """Largest displacement of the object after all forces [m]. Source: paper, evaluation metric."""
+    """The displacement of the object must stay below this [m]. Source: paper, evaluation metric."""
     max_rotation: float = math.inf
-    """Largest rotation of the object after all forces [rad]."""
+    """The rotation of the object must stay below this [rad]."""
     max_closing_shift: float = math.inf
     """Largest displacement of the object while the hand closes [m]."""
     max_closing_rotation: float = math.inf
     """Largest rotation of the object while the hand closes [rad]."""
     max_penetration: float = math.inf
-    """Deepest penetration of hand and object in the labelled grasp [m]."""
+    """Largest penetration of hand and object in the labelled grasp [m]."""
     max_self_penetration: float = math.inf
-    """Summed penetration of the hand's links in the labelled grasp [m]."""
+    """Largest summed penetration of the hand's links in the labelled grasp [m]."""
     timestep: float = 0.005
-    """[s]; 5 ms agrees with 1 ms on 97 % of verdicts."""
+    """Time step of the simulation [s]; with 1 ms nearly all verdicts are the same."""
     impratio: float = 10.0
-    """Friction to normal impedance; at 1 objects creep."""
+    """Ratio of frictional to normal impedance; at 1 objects creep."""
     noslip: int = 0
     """Iterations of the solver that removes residual slip."""
     stiffness: float = 3.0
     """Gain of the position servos [Nm/rad]; 100 ejects objects."""
     damping: float = 0.3
-    """[Nms/rad]"""
+    """Damping of the servos [Nms/rad]."""
     armature: float = 1e-3
-    """[kg m^2]"""
+    """Inertia that is added to every joint [kg m^2]."""
     force_limit: float = 20.0
     """Largest servo torque [Nm]."""
     effort: bool = False
@@ -114,6 +116,7 @@ class Protocol(Checked):
     lever: float = 0.03
     """Lever arm of sliding joints [m]: they get the servo of a turning joint that acts at this distance."""
     perturbations: Perturbations = field(default_factory=Perturbations)
+    """Further trials of each grasp under other conditions."""
 
     def __post_init__(self) -> None:
         """Refuse a name that labels could not be told apart with: OptionError."""
@@ -123,10 +126,10 @@ class Protocol(Checked):
 
     @property
     def label(self) -> str:
-        """Name and version, as stored with results, with every number that is not the one of its name: no two are alike.
+        """Name and version, as stored with outcomes, with every number that differs from the protocol of this name.
 
-        What differs from the protocol of this name, or from the defaults where there is none, is `+field=value`; friction,
-        as it always was, `+friction3`.
+        A difference, or one from the defaults where no protocol has the name, is written `+field=value`; friction is
+        written `+friction3`.
         """
         changes = "".join(_differences(self, PROTOCOLS.get(self.name) or Protocol(self.name)))
         return f"{self.name}{changes.replace('+friction=', '+friction')}/{self.version}"

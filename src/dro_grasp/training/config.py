@@ -20,7 +20,7 @@ class AugmentationConfig(Checked):
     """Largest rotation between the open hand's placement and the grasp's wrist pose, for networks that know the placement
     [rad]. Source: ours."""
     placement_shift: float = 0.004
-    """Standard deviation of the shift between them, along each axis [m]. Source: ours."""
+    """Standard deviation of the shift between the two, along each axis [m]. Source: ours."""
     tilt: float = math.radians(30)
     """For networks that do not know the placement, the largest angle by which the open hand is turned from the grasp's wrist
     rotation, about an axis perpendicular to the direction from the wrist to the object [rad]. Source: the official
@@ -37,12 +37,15 @@ class LossConfig(Checked):
     """Weights of the four terms, and of those that are ours. Source: the official release, where nothing else is said."""
 
     distance: float = 1.0
+    """Weight of the error of D(R,O) [m]."""
     pose: float = 0.01
+    """Weight of the error of link poses [m + rad]."""
     penetration: float = 5.0
-    """Differs from the release (1): at 1 the hand ends up a few millimetres inside the object."""
+    """Weight of the penetration [m]. Differs from the release (1): at 1 the hand ends up some millimetres in the object."""
     divergence: float = 0.01
+    """Weight of the KL divergence of z [nat]."""
     divergence_form: Literal["batch_mean", "official"] = "batch_mean"
-    """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
+    """Form of the divergence: sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
     motion: float = 1.0
     """Weight of the mean distance between the hand as z moves it and the true grasp; not in the paper's form."""
     flow: float = 0.01
@@ -57,9 +60,10 @@ LOSSES = {"ours": LossConfig(), "release": LossConfig(penetration=1.0, divergenc
 
 @dataclass(frozen=True)
 class ScheduleConfig(Checked):
-    """Optimiser and bookkeeping of both loops."""
+    """Optimiser, checkpoints and log of pretraining and training."""
 
     steps: int = 10_000
+    """Optimiser steps."""
     minutes: float | None = None
     """Time limit [min]; the learning rate follows steps or time, whichever is further on."""
     learning_rate: float = 1e-3
@@ -81,7 +85,7 @@ class ScheduleConfig(Checked):
     tensorboard: bool = False
     """Also write the log for TensorBoard, which must be installed."""
     mixed: bool = False
-    """Multiply in bfloat16 in encoders and transformers: twice as fast on hardware that supports it."""
+    """Multiply in bfloat16 in encoders and transformers: faster on hardware that supports it."""
     device: str = "cpu"
     """Device of network and samples: `cpu`, `cuda`, `cuda:1`. Another kind of device draws other samples."""
     seed: int = 0
@@ -96,7 +100,9 @@ class TrainConfig(Checked):
     losses: LossConfig = LossConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
+    """Hands in a shard of a step's batch."""
     samples_per_hand: int = 4
+    """Grasps of each of these hands."""
     by_count: float = 0.0
     """Hands are drawn in proportion to the number of their grasps to this power; at 0 each as often as any other."""
     columns: int = 48
@@ -128,11 +134,13 @@ class PretrainConfig(Checked):
 
     schedule: ScheduleConfig = ScheduleConfig(steps=3_000)
     hands_per_step: int = 4
+    """Hands in a shard of a step's batch."""
     samples_per_hand: int = 4
+    """Pairs of poses of each of these hands."""
     temperature: float = 0.1
-    """tau. Source: paper section III-B."""
+    """Temperature tau of the contrastive loss. Source: paper section III-B."""
     sharpness: float = 10.0
-    """lambda of the tanh weights [1/m]. Source: paper section III-B."""
+    """Factor lambda in the tanh weights [1/m]. Source: paper section III-B."""
     rotation: float = math.radians(15)
     """Largest rotation between the two clouds' wrists, for networks that know the placement [rad]; others are pretrained with
     the tilt of their training. Source: ours."""
@@ -145,6 +153,8 @@ class MotionConfig(Checked):
     schedule: ScheduleConfig = ScheduleConfig(steps=5_000)
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
+    """Hands in a shard of a step's batch."""
     samples_per_hand: int = 16
+    """Pairs of poses of each of these hands."""
     divergence: float = 1e-5
     """Weight of the divergence of z from N(0, I) [m/nat]; main training weighs it more."""

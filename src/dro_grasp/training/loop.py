@@ -31,10 +31,14 @@ def train(
     """Train on a bundle.
 
     Args:
+        bundle: Hands, objects and grasps.
+        network: Form and sizes of the network.
+        config: Schedule, losses and samples.
         folder: Run folder; a checkpoint in it is resumed and reproduces the curve.
         pretrained: Source of the hand encoder, and of the motion where z moves the hand. Without it, and without
-            `initial`, the hand encoder is trained along.
+            `initial`, the hand encoder is trained too.
         report: Called every few steps; the console by default.
+        name: Name of the trained network.
         initial: Weights to begin with, as in fine-tuning; `network` must be their configuration.
 
     Returns:

@@ -23,7 +23,7 @@ from tests.helpers.weights import untrained_weights
 pytest.importorskip("fastapi", reason="needs the extra [apps]: pip install '.[apps]'")
 pytest.importorskip("uvicorn", reason="needs the extra [apps]: pip install '.[apps]'")
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 OPTIONS: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
 

@@ -28,7 +28,13 @@ class GraspClient:
 
     @checked
     def __init__(self, url: str = "http://127.0.0.1:8090", token: str | None = None, timeout: float = 120.0) -> None:
-        """Remember where to ask, with the server's token if it wants one, and the longest wait for an answer [s]."""
+        """Remember where to ask.
+
+        Args:
+            url: Address of the server.
+            token: What the server demands, if it has one.
+            timeout: Longest wait for an answer [s].
+        """
         self.url, self.timeout = url.rstrip("/"), timeout
         self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
 

@@ -266,7 +266,20 @@ def view_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, predicted_points: Float[Tensor, "n n_points 3"] | None = None,
     port: int = 8080, host: str = HOST,
 ) -> None:
-    """Serve a page of grasps until Ctrl-C; arguments as for `GraspViewer`."""
+    """Serve a page of grasps until Ctrl-C.
+
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object.
+        grasps: One at least.
+        predicted_points: Hand points multilaterated from D(R,O), before the solver [m].
+        port: If it is taken, the next free one is used.
+        host: Address to serve at; by default only this machine can connect.
+
+    Raises:
+        OptionError: There is no grasp, or port or host is invalid.
+        GraspFileError: The grasps are of another hand.
+    """
     serve(GraspViewer(hand, obj, grasps, predicted_points, port, host))
 
 

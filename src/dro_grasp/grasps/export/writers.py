@@ -32,6 +32,7 @@ class Frame:
     """The frame that poses are given in."""
 
     name: str = OBJECT
+    """Name of the frame."""
     T_frame_object: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
     """Takes coordinates of the object's frame to this one [m]."""
 
@@ -73,7 +74,7 @@ class Frame:
         return grasps.object[0]
 
     def sentence(self, grasps: GraspBatch) -> str:
-        """This frame in words."""
+        """A sentence that states this frame, for comments in files."""
         own = self.name == OBJECT and frame_of(grasps) is None
         return f"{'the mesh frame of object' if own else 'frame'} '{self.name_for(grasps)}'"
 

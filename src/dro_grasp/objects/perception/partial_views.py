@@ -95,8 +95,10 @@ def visible_points(
     Rays are cast at a mesh. Of a bare cloud, the visible points are those that no others hide.
 
     Args:
+        obj: A mesh or a bare cloud.
         direction: From the object towards the camera, of any length: three numbers.
         generator: Draws noise and lost pixels.
+        camera: The depth camera; the default one if omitted.
 
     Raises:
         OptionError: The direction has no length, or the camera stands inside the object.

@@ -77,13 +77,14 @@ def scanned_object(
     Arrays, tensors and nested lists are taken.
 
     Args:
+        name: What to call the object.
         points: Points in the camera's frame, (n, 3) [m].
         T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
             `table` are given; the camera's own frame by default.
         denoise: Drop outliers.
         complete: Add the unseen side; switch it off for a scan from all sides.
-        keep_table: Take every point for the object's. By default a table in the cloud is found and cut off, said in a note, and
-            hands stay above it.
+        keep_table: Keep every point. By default a table in the cloud is found and cut off, with a note, and hands stay above
+            it.
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.

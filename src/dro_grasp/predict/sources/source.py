@@ -26,13 +26,13 @@ class Candidates:
     """Grasps as a source proposes them."""
 
     grasps: GraspBatch
-    """On the CPU; pregrasp and squeeze may be unknown, and scores count for nothing."""
+    """Grasps, on the CPU. Pregrasp and squeeze may be unknown; scores are ignored."""
     points: Float[Tensor, "n n_points 3"]
     """Hand points of each candidate, on the CPU [m]. The network's are multilaterated; the solved hand differs from them."""
     origin: tuple[str, ...] = ()
     """Name of the source of each candidate."""
     turned: int = 0
-    """How many others were lost as they were made, because they turned away from the direction."""
+    """How many others the source dropped because they turned away from the palm direction."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by part of the source [s]."""
 
