@@ -79,7 +79,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *effort_notes(hand),
+             *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 

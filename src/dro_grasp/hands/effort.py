@@ -14,11 +14,10 @@ from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
 
 TIP_FORCE = 10.0
-"""Force that a finger exerts with its tip, where nothing better is known [N]. Ours: catalogues of hands of human size state 5 to
-20 N."""
-GRIP_FORCE = 40.0  # Force of a jaw that slides, likewise [N]. Ours: catalogues of electric grippers state 20 to 140 N
+"""Force that a finger exerts with its tip, where nothing better is known [N]. Ours: makers of hands state 5 to 20 N."""
+GRIP_FORCE = 40.0  # Force of a jaw that slides, likewise [N]. Ours: makers of electric grippers state 20 to 140 N
 LEAST, MOST = 0.1, 40.0
-"""An effort is believed if it is within these multiples of what suits the hand's size. Ours: files state 0 and 1000 for none."""
+"""Multiples of what suits the hand's size within which an effort is believed. Ours: files state 0 and 1000 for none."""
 SHORTEST = 0.01  # Least lever arm from a joint to its fingertip [m] (ours)
 
 
@@ -63,8 +62,9 @@ def effort_notes(hand: Hand) -> Iterator[Note]:
     found, told = find_efforts(hand), hand.description.efforts
     for text, rows in (
         ("state no effort", np.isnan(told)), ("state an effort that does not suit the hand's size", ~np.isnan(told))):
-        names = [name for name, row, ok in zip(hand.tree.joint_names, rows, found.stated.tolist(), strict=True) if row and not ok]
-        if names:
-            taken = [float(found.limit[hand.tree.joint_names.index(name)]) for name in names]
-            yield Note("info", ", ".join(names), f"{text}; {min(taken):.2g} to {max(taken):.2g} Nm (N where it slides) are taken, "
-                       f"with which fingertips press by {TIP_FORCE:.0f} N")
+        missing = torch.from_numpy(rows) & ~found.stated
+        if bool(missing.any()):
+            names = [name for name, row in zip(hand.tree.joint_names, missing.tolist(), strict=True) if row]
+            taken = found.limit[missing]
+            yield Note("info", ", ".join(names), f"{text}; {float(taken.min()):.2g} to {float(taken.max()):.2g} Nm (N where it "
+                       f"slides) are taken, with which fingertips press by {TIP_FORCE:.0f} N")

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.optimize import linprog
-from scipy.sparse import block_diag, csr_matrix, hstack, vstack
+from scipy.sparse import block_diag, csr_matrix, hstack
 
 from dro_grasp.geometry.contact_forces import friction_cone
 from dro_grasp.grasps.batch import GraspBatch

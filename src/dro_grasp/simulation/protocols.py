@@ -168,7 +168,7 @@ CARRY = Protocol(
     "carry", friction=0.5, torsional_friction=0.005, force=9.81, gradual=True, reset=True, max_rotation=math.radians(15),
     max_penetration=STRICT.max_penetration, max_self_penetration=STRICT.max_self_penetration, noslip=2, effort=True,
 )
-"""What a robot asks for that lifts things: the object's own weight in any direction, with fingers as strong as they are (ours)."""
+"""What a robot that lifts things asks for: the object's weight in any direction, and fingers as strong as they are (ours)."""
 PROTOCOLS = {
     "carry": CARRY,
     "dro": Protocol("dro"),
