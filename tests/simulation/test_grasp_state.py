@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cvxpy
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,17 @@ from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import grasp_state as module
-from dro_grasp.simulation.grasp_state import CHANGE, LEVER, NO_ANSWER, PUSH, ContactForces, grasp_state, unanswered
+from dro_grasp.simulation.grasp_state import (
+    CHANGE,
+    LEVER,
+    NO_ANSWER,
+    PUSH,
+    ContactForces,
+    WeightConfig,
+    grasp_state,
+    unanswered,
+    weight_torques,
+)
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, power_grasp
 
@@ -33,7 +44,7 @@ def obj() -> ObjectModel:
 def pinch(pressure: float, points: int = 2) -> ContactForces:
     """Contacts on opposite sides of a ball of 3 cm."""
     x = np.array([[1.0, 0, 0], [-1.0, 0, 0]])[:points]
-    return ContactForces(-x, 0.03 * x, np.full(points, pressure), np.zeros(points), points)
+    return ContactForces(-x, 0.03 * x, 0.03 * x, np.arange(points), np.full(points, pressure), np.zeros(points))
 
 
 def plain(c: ContactForces, mass: float, friction: float) -> list[float]:
@@ -76,7 +87,7 @@ def test_motion_and_contacts_are_those_of_a_trial(hand: Hand, obj: ObjectModel) 
     T = grasps.T_object_wrist.clone()
     T[1, 2, 3] -= 0.01
     grasps = grasps.replace(T_object_wrist=T)
-    found, trial = grasp_state(hand, obj, grasps), simulate(hand, obj, grasps, "strict")
+    (found, _), trial = grasp_state(hand, obj, grasps), simulate(hand, obj, grasps, "strict")
     torch.testing.assert_close(found.shift, trial.closing_shift)
     torch.testing.assert_close(found.turn, trial.closing_rotation)
     assert found.links.tolist() == [len(links) for links in trial.contact_links]
@@ -90,7 +101,7 @@ def test_an_open_hand_holds_nothing(hand: Hand, obj: ObjectModel) -> None:
     far = grasps.T_object_wrist.clone()
     far[:, 2, 3] -= 0.5
     away = grasps.replace(T_object_wrist=far, joints=opened, pregrasp_joints=opened, squeeze_joints=opened)
-    found = grasp_state(hand, obj, away)
+    found, _ = grasp_state(hand, obj, away)
     assert found.contacts.tolist() == found.links.tolist() == found.pressure.tolist() == [0.0]
     assert found.unanswered.tolist() == [[NO_ANSWER, NO_ANSWER]]
     assert float(found.shift) == float(found.speed) == 0.0
@@ -99,10 +110,61 @@ def test_an_open_hand_holds_nothing(hand: Hand, obj: ObjectModel) -> None:
 def test_a_firmer_squeeze_presses_harder(hand: Hand, obj: ObjectModel) -> None:
     grasps = complete(hand, power_grasp(hand, obj, 1), torch.as_tensor(obj.centre_of_mass))
     firmer = grasps.replace(squeeze_joints=2 * grasps.squeeze_joints - grasps.joints)
-    assert 1.5 * grasp_state(hand, obj, grasps).pressure < grasp_state(hand, obj, firmer).pressure
+    assert 1.5 * grasp_state(hand, obj, grasps)[0].pressure < grasp_state(hand, obj, firmer)[0].pressure
 
 
 def test_no_grasps_hold_nothing(hand: Hand, obj: ObjectModel) -> None:
-    found = grasp_state(hand, obj, power_grasp(hand, obj, 1)[:0])
+    found, _ = grasp_state(hand, obj, power_grasp(hand, obj, 1)[:0])
     assert found.shift.shape == (0,)
     assert found.unanswered.shape == (0, 2)
+
+
+def held_by(links: np.ndarray, points: np.ndarray, centre: np.ndarray) -> ContactForces:
+    """Contacts at points of links that press towards a centre."""
+    arm = points - centre
+    inward = -arm / np.linalg.norm(arm, axis=1, keepdims=True)
+    return ContactForces(inward, arm, points, links, np.arange(len(points), 0, -1.0), np.zeros(len(points)))
+
+
+def least_forces(c: ContactForces, weight: float, friction: float, edges: int) -> np.ndarray:
+    """Mean of the least forces at the contacts that balance a weight along six axes, by CVXPY."""
+    found = []
+    for axis in [*np.eye(3), *-np.eye(3)]:
+        forces, amounts = [], []
+        for n in c.normal:
+            side = np.cross(n, np.eye(3)[np.abs(n).argmin()])
+            side /= np.linalg.norm(side)
+            angles = np.arange(edges) * 2 * math.pi / edges
+            cone = n + friction * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(n, side))
+            amounts.append(cvxpy.Variable(edges, nonneg=True))
+            forces.append(cone.T @ amounts[-1])
+        torque = sum(np.cross(np.eye(3), r).T @ f for r, f in zip(c.arm, forces, strict=True))
+        missing = cvxpy.sum_squares(sum(forces) + axis) + cvxpy.sum_squares(torque / LEVER)
+        least = cvxpy.Minimize(missing + module.SMALLEST * cvxpy.sum_squares(cvxpy.hstack(amounts)))
+        cvxpy.Problem(least).solve(solver=cvxpy.CLARABEL)
+        found.append(np.stack([f.value for f in forces]))
+    return weight * np.mean(found, 0)
+
+
+def test_torques_that_hold_the_weight_are_those_of_the_least_forces(hand: Hand) -> None:
+    joints = 0.4 * torch.ones(1, hand.tree.n_dof)
+    tips = np.array(hand.tips)
+    points = (hand.tree.forward(joints)[0, tips, :3, 3] + torch.tensor([0.0, 0.0, 0.03])).double().numpy()
+    contacts = held_by(tips, points, points.mean(0) + np.array([0.004, 0.002, -0.003]))
+    config = WeightConfig(margin=1.5, iterations=2000)
+    found = weight_torques(hand, [contacts], joints, torch.tensor([0.2]), config)[0]
+    forces = least_forces(contacts, 1.5 * 9.81 * 0.2, config.friction, config.edges)
+    jacobian = hand.tree.point_jacobian(
+        hand.tree.forward(joints)[0], torch.from_numpy(points).float(), torch.from_numpy(tips)).double().numpy()
+    expected = np.einsum("kc,kcd->d", forces, jacobian)
+    assert np.abs(expected).max() > 0.01
+    np.testing.assert_allclose(found.numpy(), expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_nothing_presses_for_a_weight_without_margin_or_contacts(hand: Hand) -> None:
+    joints = torch.zeros(1, hand.tree.n_dof)
+    nothing = held_by(np.zeros(0, int), np.zeros((0, 3)), np.zeros(3))
+    assert not weight_torques(hand, [nothing], joints, MASS).any()
+    tips = np.array(hand.tips)
+    some = held_by(tips, np.eye(4)[:, :3] * 0.03 + 0.05, np.zeros(3))
+    assert not weight_torques(hand, [some], joints, MASS, WeightConfig(margin=0.0)).any()

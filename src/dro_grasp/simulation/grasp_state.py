@@ -33,6 +33,7 @@ UNIT = 10.0  # Acceleration of the object by which pushes and the forces of cont
 BEARS = 0.05  # Normal force of a contact above which its slip counts [N] (ours)
 EDGES = 6  # Edges of a friction cone (ours)
 RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
+SMALLEST = 1e-3  # Weight of the squared forces beside the weight that they hold (ours)
 STEPS = 80  # Steps of the solver (ours)
 NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)
 
@@ -188,7 +189,7 @@ def weight_torques(
     wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1).flatten(1, 2).mT
     pulls = torch.as_tensor(FORCES).to(joints)
     goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).repeat(n, 1)
-    amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, RIDGE * 10, config.iterations)
+    amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, SMALLEST, config.iterations)
     mean = amounts.unflatten(0, (n, len(pulls))).mean(1).unflatten(1, (k, config.edges))
     force = config.margin * config.gravity * mass[:, None, None] * (mean[..., None] * cone).sum(-2)
     jacobian = torch.stack([
