@@ -4,10 +4,12 @@
 
 Each fault is one change at one place, of a kind that people make. It is planted in a temporary copy of the tracked files; the
 checkout stays as it is. Tests run in one process and stop at the first that fails: those of the mirrored folder first, then
-the files that import the module, then all others, and tests/golden last, so that a fault which golden alone finds is told
-apart. The test that found a fault must pass on a copy without it. Results are kept in out/mutations.json: a rerun does what
-is missing, and what `--only` names. The first run takes the whole suite once, without any fault, to know how long each file
-takes.
+the files that import the module. The faults that are left are then planted together, all other tests run once, and each fault
+is planted alone for those that fail; a test that passes only because of two faults would be overlooked. tests/golden comes
+last, so that a fault which golden alone finds is told apart. The test that found a fault must pass on a copy without it.
+
+Results are kept in out/mutations.json: a rerun does what is missing, and what `--only` names. Copies begin with the user's
+cache of derived geometry, which no fault here would change.
 """
 
 from __future__ import annotations
@@ -21,20 +23,21 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.files import replacing
+from dro_grasp.objects.cache import cache_folder
 
 ROOT = Path(__file__).parents[1]
 """The checkout."""
 RESULTS = ROOT / "out" / "mutations.json"
-"""What was found so far, and the seconds of each test file."""
+"""What was found so far."""
 LONGEST = 3600.0
-"""Time after which tests of a fault are given up [s]; such a fault counts as missed (ours)."""
+"""Time after which tests are given up [s] (ours)."""
 GOLDEN = "tests/golden/"
 """Tests that compare results bitwise with recorded ones: they find that something changed, not that it is wrong."""
 STAGES = ("mirrored", "importing", "others", "golden")
@@ -138,7 +141,7 @@ def tracked(root: Path = ROOT) -> list[str]:
 
 
 @contextmanager
-def copy(cache: Path) -> Iterator[Path]:
+def copy() -> Iterator[Path]:
     """A temporary copy of the tracked files, with a repository and a cache of its own."""
     with tempfile.TemporaryDirectory(prefix="mutations-") as name:
         folder = Path(name) / "checkout"
@@ -148,23 +151,13 @@ def copy(cache: Path) -> Iterator[Path]:
         git = ["git", "-C", str(folder), "-c", "user.name=lab", "-c", "user.email=lab@localhost"]
         for words in (["init", "-q"], ["add", "-A"], ["commit", "-q", "-m", "A copy"]):
             subprocess.run([*git, *words], check=True)
-        if cache.is_dir():
-            shutil.copytree(cache, Path(name) / "cache")
+        if cache_folder().is_dir():
+            shutil.copytree(cache_folder(), Path(name) / "cache")
         yield folder
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a run of tests said."""
-
-    failed: str | None
-    """The first test that failed, or the words `out of time`; None where all passed."""
-    seconds: dict[str, float]
-    """Time of each file [s]."""
-
-
-def run_tests(folder: Path, tests: Sequence[str], *options: str) -> Outcome:
-    """Run test files or single tests of a copy, in this order, as `make test` does, but in one process."""
+def run_tests(folder: Path, tests: Sequence[str], *options: str) -> tuple[str, ...]:
+    """Tests that fail of some files or single tests of a copy, run in this order, as `make test` does, but in one process."""
     report = folder.parent / "report.xml"
     report.unlink(missing_ok=True)
     words = [sys.executable, "-m", "pytest", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-o",
@@ -173,112 +166,118 @@ def run_tests(folder: Path, tests: Sequence[str], *options: str) -> Outcome:
     try:
         done = subprocess.run(words, cwd=folder, env=os.environ | here, capture_output=True, text=True, timeout=LONGEST,
                               check=False)
-    except subprocess.TimeoutExpired:
-        return Outcome("out of time", {})
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"tests took longer than {LONGEST:.0f} s: {' '.join(tests[:3])} ...") from error
     if done.returncode not in (0, 1, 2, 5) or not report.is_file():  # 5: every test was deselected
         raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
-    return read_report(report)
+    return tuple(failures(report))
 
 
-def read_report(report: Path) -> Outcome:
-    """The first failure in a report of pytest, and the time of each file."""
-    seconds: dict[str, float] = {}
-    failed = None
+def failures(report: Path) -> Iterator[str]:
+    """Tests that failed, and modules that could not be imported, in a report of pytest."""
     for case in ET.parse(report).iter("testcase"):
-        file, name = case.get("file"), case.get("name", "")
-        if file is None:  # a module that could not be imported
-            file, name = name.replace(".", "/") + ".py", ""
-        seconds[file] = seconds.get(file, 0.0) + float(case.get("time", 0))
-        if failed is None and (case.find("failure") is not None or case.find("error") is not None):
-            failed = f"{file}::{name}" if name else file
-    return Outcome(failed, seconds)
+        if case.find("failure") is not None or case.find("error") is not None:
+            file, name = case.get("file"), case.get("name", "")
+            yield f"{file}::{name}" if file else name.replace(".", "/") + ".py"
 
 
-def stages(fault: Fault, files: dict[str, str], seconds: dict[str, float]) -> dict[str, list[str]]:
-    """Test files, given with their text, by STAGES; within each the one of the module's name first, then quick ones first."""
-    name = Path(fault.path).stem
+def near(fault: Fault, files: Mapping[str, str]) -> list[list[str]]:
+    """Of test files, given with their text, those of the mirrored folder, and the others that import the module."""
+    name, (parent, _, last) = Path(fault.path).stem, fault.module.rpartition(".")
     folder = Path("tests") / Path(fault.path).parent
     while folder != Path("tests") and not any(Path(file).is_relative_to(folder) for file in files):
         folder = folder.parent
-    parent, _, last = fault.module.rpartition(".")
     imports = (fault.module + " ", fault.module + "\n", f"from {parent} import {last}")
-    found: dict[str, list[str]] = {stage: [] for stage in STAGES}
-    for file, text in files.items():
-        own = Path(file).name == f"test_{name}.py" if folder == Path("tests") else Path(file).is_relative_to(folder)
-        stage = ("golden" if file.startswith(GOLDEN) else "mirrored" if own
-                 else "importing" if any(words in text for words in imports) else "others")
-        found[stage].append(file)
-    for group in found.values():
-        group.sort(key=lambda file: (Path(file).name != f"test_{name}.py", seconds.get(file, 0.0), file))
-    return found
+    mirrored, importing = [], []
+    for file, text in sorted(files.items(), key=lambda pair: (Path(pair[0]).name != f"test_{name}.py", pair[0])):
+        if Path(file).is_relative_to(folder) if folder != Path("tests") else Path(file).name == f"test_{name}.py":
+            mirrored.append(file)
+        elif any(words in text for words in imports):
+            importing.append(file)
+    return [mirrored, importing]
 
 
-def search(fault: Fault, files: dict[str, str], seconds: dict[str, float], cache: Path) -> dict[str, Any]:
-    """Whether tests find a fault: the stage and the test that did, and the time it took [s]."""
-    begin, found = time.monotonic(), {"found": False, "stage": None, "by": None}
-    with copy(cache) as folder:
-        fault.plant(folder)
-        for stage, tests in stages(fault, files, seconds).items():
-            failed = run_tests(folder, tests, "-x").failed if tests else None
-            if failed is not None:
-                found = {"found": failed != "out of time", "stage": stage, "by": failed}
-                break
-    found["seconds"] = round(time.monotonic() - begin, 1)
-    if found["found"]:
-        with copy(cache) as folder:
-            if (other := run_tests(folder, [str(found["by"])]).failed) is not None:
-                raise RuntimeError(f"{other} fails without any fault, too: mend it first")
-    return found
+def run_with(faults: Sequence[Fault], tests: Sequence[str], *options: str) -> tuple[str, ...]:
+    """Tests that fail on a copy with these faults."""
+    if not tests:
+        return ()
+    with copy() as folder:
+        for fault in faults:
+            fault.plant(folder)
+        return run_tests(folder, tests, *options)
 
 
-def measured(cache: Path) -> dict[str, float]:
-    """Seconds of each test file without a fault, and a cache of what the tests derive; RuntimeError: a test fails."""
-    with copy(cache) as folder:
-        outcome = run_tests(folder, ["tests"])
-        if outcome.failed is not None:
-            raise RuntimeError(f"{outcome.failed} fails without any fault: mend it first")
-        shutil.copytree(folder.parent / "cache", cache, dirs_exist_ok=True)
-    return {file: round(spent, 2) for file, spent in outcome.seconds.items()}
+class Search:
+    """What was found so far, kept as it comes."""
+
+    def __init__(self) -> None:
+        """Take up earlier runs."""
+        self.found: dict[str, dict[str, Any]] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+        texts = {name: (ROOT / name).read_text() for name in tracked()
+                 if name.startswith("tests/") and Path(name).match("test_*.py")}
+        self.golden = [name for name in texts if name.startswith(GOLDEN)]
+        self.files = {name: text for name, text in texts.items() if name not in self.golden}
+
+    def run(self, faults: Sequence[Fault]) -> None:
+        """Search with the next stage that a fault has not passed, until it is found or has passed all."""
+        for fault in faults:
+            for stage, tests in zip(STAGES, near(fault, self.files), strict=False):
+                if self.is_open(fault, stage):
+                    self.search(fault, stage, tests)
+        for stage, tests in zip(STAGES[2:], (list(self.files), self.golden), strict=True):
+            left = [fault for fault in faults if self.is_open(fault, stage)]
+            failed = run_with(left, tests) if len(left) > 1 else tests
+            for fault in left:
+                self.search(fault, stage, failed)
+
+    def entry(self, fault: Fault) -> dict[str, Any]:
+        """Of a fault: the test that found it with its stage, the stages that it passed, and the time [s]."""
+        return self.found.setdefault(fault.breaks, {"by": None, "stage": None, "passed": [], "seconds": 0.0})
+
+    def is_open(self, fault: Fault, stage: str) -> bool:
+        """Whether a fault is still to be searched for with this stage."""
+        return self.entry(fault)["by"] is None and stage not in self.entry(fault)["passed"]
+
+    def search(self, fault: Fault, stage: str, tests: Sequence[str]) -> None:
+        """Search for one fault with these tests, and keep the outcome."""
+        begin, entry = time.monotonic(), self.entry(fault)
+        failed = run_with([fault], tests, "-x")
+        entry["seconds"] += round(time.monotonic() - begin, 1)
+        if failed and (other := run_with([], failed[:1])):
+            raise RuntimeError(f"{other[0]} fails without any fault, too: mend it first")
+        if failed:
+            entry |= {"by": failed[0], "stage": stage}
+        else:
+            entry["passed"].append(stage)
+        print(f"{FAULTS.index(fault) + 1}, {stage}: {entry['by'] or 'not found'} ({entry['seconds']:.0f} s)",
+              file=sys.stderr, flush=True)
+        RESULTS.parent.mkdir(exist_ok=True)
+        with replacing(RESULTS) as temporary:
+            temporary.write_text(json.dumps(self.found, indent=1) + "\n")
 
 
-def save(results: dict[str, Any]) -> None:
-    """Write the results."""
-    RESULTS.parent.mkdir(exist_ok=True)
-    with replacing(RESULTS) as temporary:
-        temporary.write_text(json.dumps(results, indent=1) + "\n")
-
-
-def table(results: dict[str, Any]) -> str:
+def table(found: Mapping[str, dict[str, Any]]) -> str:
     """The results for people."""
-    found = [(i, fault, results[fault.breaks]) for i, fault in enumerate(FAULTS, 1) if fault.breaks in results]
+    done = [(i, fault, found[fault.breaks]) for i, fault in enumerate(FAULTS, 1) if fault.breaks in found]
     lines = ["| n | file | what is wrong | found by | stage | s |", "|---|---|---|---|---|---|"]
     lines += [f"| {i} | `{fault.path}` | {fault.breaks} | {each['by'] or '**missed**'} | {each['stage'] or ''} "
-              f"| {each['seconds']:.0f} |" for i, fault, each in found]
-    count = sum(each["found"] for _, _, each in found)
-    golden = sum(each["found"] and each["stage"] == "golden" for _, _, each in found)
-    return "\n".join([*lines, "", f"{count} of {len(found)} planted faults are found, {golden} of them by tests/golden alone."])
+              f"| {each['seconds']:.0f} |" for i, fault, each in done]
+    count, golden = (sum(each["by"] is not None and each["stage"] in of for _, _, each in done) for of in (STAGES, STAGES[-1:]))
+    return "\n".join([*lines, "", f"{count} of {len(done)} planted faults are found, {golden} of them by tests/golden alone."])
 
 
 def main() -> None:
-    """Search for what is missing, or for the faults that are named, and print the table."""
+    """Search for what is missing, or anew for the faults that are named, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", type=int, nargs="+", choices=range(1, len(FAULTS) + 1), metavar="N",
                         help="faults by their numbers, searched for even where there is a result")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
-    given = parser.parse_args()
-    results: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {"seconds": {}, "faults": {}}
-    cache = RESULTS.parent / "mutations-cache"
-    if not results["seconds"]:
-        results["seconds"] = measured(cache)
-        save(results)
-    files = {file: (ROOT / file).read_text() for file in tracked()
-             if file.startswith("tests/") and Path(file).match("test_*.py")}
-    for i, fault in enumerate(FAULTS, 1):
-        if i in given.only if given.only else fault.breaks not in results["faults"]:
-            results["faults"][fault.breaks] = each = search(fault, files, results["seconds"], cache)
-            print(f"{i}: {each['by'] or 'missed'} ({each['seconds']:.0f} s)", file=sys.stderr, flush=True)
-            save(results)
-    print(json.dumps(results["faults"], indent=1) if given.json else table(results["faults"]))
+    given, search = parser.parse_args(), Search()
+    faults = [FAULTS[i - 1] for i in given.only] if given.only else list(FAULTS)
+    for fault in faults if given.only else ():
+        search.found.pop(fault.breaks, None)
+    search.run(faults)
+    print(json.dumps(search.found, indent=1) if given.json else table(search.found))
 
 
 if __name__ == "__main__":
