@@ -219,7 +219,7 @@ class Search:
         self.files = {name: text for name, text in texts.items() if name not in self.golden}
 
     def run(self, faults: Sequence[Fault]) -> None:
-        """Search with the next stage that a fault has not passed, until it is found or has passed all."""
+        """Search with the stages that each fault has not passed until it is found; RuntimeError: tests fail without a fault."""
         for fault in faults:
             for stage, tests in zip(STAGES, near(fault, self.files), strict=False):
                 if self.is_open(fault, stage):
@@ -229,10 +229,17 @@ class Search:
             failed = run_with(left, tests) if len(left) > 1 else tests
             for fault in left:
                 self.search(fault, stage, failed)
+        unsure = [entry for fault in faults if (entry := self.entry(fault))["by"] and not entry["clean"]]
+        if other := run_with([], sorted({entry["by"] for entry in unsure})):
+            raise RuntimeError(f"{', '.join(other)} fail without any fault, too: mend them first")
+        for entry in unsure:
+            entry["clean"] = True
+        self.save()
 
     def entry(self, fault: Fault) -> dict[str, Any]:
-        """Of a fault: the test that found it with its stage, the stages that it passed, and the time [s]."""
-        return self.found.setdefault(fault.breaks, {"by": None, "stage": None, "passed": [], "seconds": 0.0})
+        """The test that found a fault, its stage, and whether it passes without; the stages that passed before; the time [s]."""
+        return self.found.setdefault(fault.breaks, {
+            "by": None, "stage": None, "passed": [], "seconds": 0.0, "clean": False})
 
     def is_open(self, fault: Fault, stage: str) -> bool:
         """Whether a fault is still to be searched for with this stage."""
@@ -243,14 +250,16 @@ class Search:
         begin, entry = time.monotonic(), self.entry(fault)
         failed = run_with([fault], tests, "-x")
         entry["seconds"] += round(time.monotonic() - begin, 1)
-        if failed and (other := run_with([], failed[:1])):
-            raise RuntimeError(f"{other[0]} fails without any fault, too: mend it first")
         if failed:
             entry |= {"by": failed[0], "stage": stage}
         else:
             entry["passed"].append(stage)
         print(f"{FAULTS.index(fault) + 1}, {stage}: {entry['by'] or 'not found'} ({entry['seconds']:.0f} s)",
               file=sys.stderr, flush=True)
+        self.save()
+
+    def save(self) -> None:
+        """Write what was found."""
         RESULTS.parent.mkdir(exist_ok=True)
         with replacing(RESULTS) as temporary:
             temporary.write_text(json.dumps(self.found, indent=1) + "\n")
