@@ -237,7 +237,7 @@ class Search:
         self.save()
 
     def entry(self, fault: Fault) -> dict[str, Any]:
-        """The test that found a fault, its stage, and whether it passes without; the stages that passed before; the time [s]."""
+        """The test that found a fault, its stage, and whether it passes without; the stages passed before; the time [s]."""
         return self.found.setdefault(fault.breaks, {
             "by": None, "stage": None, "passed": [], "seconds": 0.0, "clean": False})
 
