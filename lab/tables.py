@@ -57,11 +57,11 @@ class Results:
         """What a command printed.
 
         Raises:
-            MissingResult: It was not run.
+            MissingResult: It was not run as it is declared now.
         """
         path = self.folder / f"{measurement}.json"
         cells = _cells(path) if path.exists() else {}
-        if name not in cells:
+        if cells.get(name, {}).get("command") != MEASUREMENTS[measurement].cells[name]:
             raise MissingResult(measurement)
         self.used[f"{measurement}: {name}"] = cells[name]
         return cells[name]["result"]
