@@ -112,7 +112,7 @@ MEASUREMENTS = {
         hand: f"python -m lab.benchmarks.tabletop --hands {hand} --objects builtin:test --num 8 --trials --json"
         for hand in ("allegro", "barrett")}),
     "methods": Measurement("Methods of others, written anew here, beside ours", {
-        f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages returned "
+        f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages raw returned "
                                                 f"--protocols {FAST}")
         for hand in PAPER_HANDS
         for method, source, num in (

@@ -128,7 +128,7 @@ def run(jobs: list[Job], workers: int) -> int:
                 failed += bool(error)
                 left -= expected(job)
                 progress.print(f"{job.measurement}: {job.cell}: {error or 'done'}", markup=False)
-                progress.update(task, advance=1, left=f"about {left / 60 / max(1, count):.0f} min left")
+                progress.update(task, advance=1, left=f"about {max(0.0, left) / 60 / count:.0f} min left")
     return int(failed > 0)
 
 

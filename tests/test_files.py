@@ -91,6 +91,16 @@ def test_a_file_that_is_replaced_has_the_permissions_of_a_new_one_and_a_failure_
     assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [("new.txt", "new")]
 
 
+def test_whoever_reads_a_file_while_it_is_replaced_reads_the_old_one_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    with path.open() as reader:
+        with replacing(path) as temporary:
+            temporary.write_text("new")
+        assert reader.read() == "old"
+    assert path.read_text() == "new"
+
+
 def test_a_file_in_the_home_folder_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     with replacing("~/new.txt") as temporary:

@@ -22,7 +22,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.builtin import BUILTIN
-from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import AUTO, GraspRequest
@@ -114,7 +114,7 @@ def main() -> None:
     predictor, request = GraspPredictor(), GraspRequest(options.num, source=options.source)
     rows = []
     for hand in map(load_hand, options.hands):
-        for name in options.objects:
+        for name in resolve_objects(options.objects):
             obj = resting(load_object(name))
             rows += [measure(predictor, hand, obj, side, request, options.trials) for side in DIRECTIONS]
     whole, summary = [row.returned == options.num for row in rows], {}

@@ -62,6 +62,11 @@ def test_a_table_of_two_states_is_refused(tmp_path: Path, changes: dict) -> None
         tables.writer("constraints.cost", tables.constraints, tmp_path)
 
 
+def test_a_result_of_another_command_counts_as_not_measured(tmp_path: Path) -> None:
+    kept(tmp_path, "constraints", {"command": "another"})
+    assert tables.writer("constraints.cost", tables.constraints, tmp_path).startswith("not measured")
+
+
 def test_what_was_not_measured_says_so(tmp_path: Path) -> None:
     assert tables.writer("constraints.cost", tables.constraints, tmp_path) == (
         "not measured (`make results NAMES=constraints`)")

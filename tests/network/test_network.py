@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import threading
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -165,6 +167,14 @@ def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition
         assert float(along.abs().mean()) == pytest.approx(1.5, abs=0.15)
         assert float(along.abs().std()) < 0.4
         assert float(across.std()) < 0.4
+
+
+@pytest.mark.parametrize(("velocity", "end"), [(lambda z, time: z, math.e), (lambda z, time: 3 * time**2 + 0 * z, 2.0)])
+def test_a_flow_follows_its_velocity_to_second_order(velocity: Callable[[Tensor, Tensor], Tensor], end: float) -> None:
+    """A tenth of a step errs by 1.7e-3 at most here; Euler's rule, and any other weights, by far more."""
+    flow = FlowPrior(latent=1, width=4)
+    flow.velocity = lambda z, time, condition: velocity(z, time)
+    assert float(flow(torch.ones(1, 1), torch.zeros(1, 4))) == pytest.approx(end, rel=2.5e-3)
 
 
 def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:

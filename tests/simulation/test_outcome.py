@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
 import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.simulation.outcome import REMEDIES, Failure, count_failures, diagnose, next_steps
+from dro_grasp.simulation.contacts import Penetration
+from dro_grasp.simulation.outcome import REMEDIES, Failure, Measurements, count_failures, diagnose, next_steps
+from dro_grasp.simulation.protocols import Protocol
 from tests.helpers.toy_hand import toy_hand
 
 
@@ -26,6 +31,20 @@ def test_failures_are_counted_in_words_the_most_frequent_first() -> None:
     batch = grasps(None, Failure.SLIPPED, Failure.PENETRATION, Failure.SLIPPED, None, None)
     assert list(count_failures(batch).items()) == [("slipped", 2), ("hand penetrates object", 1)]
     assert diagnose(batch) == ["  2 failed: slipped", "  1 failed: hand penetrates object"]
+
+
+@pytest.mark.parametrize("kind", ["displacement", "rotation"])
+def test_with_a_reset_every_force_counts_and_without_one_the_last_alone(kind: str) -> None:
+    """Six trials; in each, another force moves or turns the object farther than the limit."""
+    still, zero = np.full((6, 6), 1e-3), np.zeros(6)
+    values = {"displacement": still, "rotation": still} | {kind: still + 0.049 * np.eye(6)}
+    touching, fingers = (("tip",),) * 6, torch.ones(6, dtype=torch.int64)
+    found = Measurements(Penetration(zero, zero), zero, zero, touching, fingers, stable=zero == 0, **values)
+    rules = Protocol("own", max_displacement=0.02, max_rotation=0.02)
+    assert found.judged(rules).success.tolist() == [True] * 5 + [False]
+    anew = found.judged(dataclasses.replace(rules, reset=True))
+    assert not anew.success.any()
+    assert set(anew.failure) == {Failure.SLIPPED if kind == "displacement" else Failure.TURNED}
 
 
 def test_where_few_hold_the_next_step_is_named() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import errno
+import itertools
 import json
 import math
 import os
@@ -364,6 +365,21 @@ def test_two_processes_descend_the_curve_of_one(
     run_stage("pretrain", bundle, tmp_path / "alone before", SHARDED)
     assert curve(tmp_path / "before") == [pytest.approx(x, rel=1e-4) for x in curve(tmp_path / "alone before")]
     assert curve(finished["train"])[0] != pytest.approx(curve(tmp_path / "alone")[0], rel=1e-4), "two shards see more"
+
+
+def test_every_shard_of_every_step_and_seed_draws_numbers_of_its_own(tmp_path: Path) -> None:
+    generator = torch.Generator()
+
+    def draw(seed: int, step: int, shard: int) -> float:
+        run = TrainingRun(tmp_path, torch.nn.Linear(1, 1), dataclasses.replace(SCHEDULE, seed=seed), generator)
+        run.step = step
+        run.seed_shard(shard)
+        return float(torch.rand((), generator=generator))
+
+    places = list(itertools.product(range(2), range(3), range(3)))
+    drawn = [draw(*place) for place in places]
+    assert len(set(drawn)) == len(places)
+    assert drawn == [draw(*place) for place in places]
 
 
 def test_shards_that_cannot_be_shared_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,9 @@ import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CAMERA, FRAME
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.grasps.export.writers import Frame
+from dro_grasp.grasps.export.writers import Frame, dexgraspbench
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -120,6 +121,11 @@ def test_moveit(grasps: GraspBatch, one: Path, camera: Path, tmp_path: Path, in_
         assert approach["direction"]["header"]["frame_id"] == hand.wrist_link
         np.testing.assert_allclose(vector, hand.palm_direction_wrist, atol=1e-6)
         assert approach["desired_distance"] > approach["min_distance"] > 0
+        for name, frame, away in (("post_grasp_retreat", message["grasp_pose"]["header"]["frame_id"], [0.0, 0.0, 1.0]),
+                                  ("post_place_retreat", hand.wrist_link, -vector)):
+            direction = message[name]["direction"]
+            assert direction["header"]["frame_id"] == frame
+            np.testing.assert_allclose([direction["vector"][k] for k in "xyz"], away, atol=1e-6)
 
 
 def test_only_a_score_makes_a_confidence(grasps: GraspBatch, tmp_path: Path) -> None:
@@ -168,6 +174,20 @@ def test_dexgraspbench_has_a_file_a_grasp(grasps: GraspBatch, one: Path, camera:
         np.testing.assert_allclose(wrist, grasps.T_object_wrist[i], atol=2e-6)
         assert (content["obj_path"], content["obj_scale"], content["frame"]) == ("mug", 1.0, "camera")
         assert content["joint_names"] == list(grasps.joint_names)
+
+
+def test_the_file_of_a_cameras_cloud_is_placed_by_the_camera_and_then_by_the_frame(grasps: GraspBatch, one: Path) -> None:
+    looking = Rotation.from_euler("xyz", [2.0, 0.4, -0.7])
+    T_base_camera = np.eye(4)
+    T_base_camera[:3, :3], T_base_camera[:3, 3] = looking.as_matrix(), [0.2, 0.5, -0.3]
+    poses = torch.from_numpy(T_base_camera).float().reshape(1, 16).expand(3, -1)
+    seen = grasps[[0, 1, 3]].replace(extra={FRAME: ["base"] * 3, CAMERA: poses})
+    T = torch.eye(4)
+    T[:3, :3], T[:3, 3] = torch.from_numpy(TURN.as_matrix()).float(), torch.tensor(SHIFT)
+    for content in dexgraspbench(seen, Frame("arm", T), str(one), 1.0):
+        point = np.array([0.1, -0.2, 0.6])  # in the file, which is in the camera's frame
+        there = TURN.apply(looking.apply(point) + T_base_camera[:3, 3]) + SHIFT
+        np.testing.assert_allclose((pose(content["obj_pose"][:3], content["obj_pose"][3:]) @ [*point, 1])[:3], there, atol=2e-6)
 
 
 def test_several_objects_get_a_file_each(grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

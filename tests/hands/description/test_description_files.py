@@ -10,9 +10,11 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import HandError
+from dro_grasp.hands.description.loader import load_description
 from dro_grasp.hands.description.tree_reading import Coupling, resolve_couplings
 from dro_grasp.hands.description.urdf import as_obj, find_mesh, resolve_meshes
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
+from tests.helpers.claw_urdf import claw, joint, written
 
 NAMES = ["a", "b", "c", "d"]
 HERE = Path("hand.urdf")
@@ -34,6 +36,20 @@ def test_a_held_joint_and_what_follows_it_are_constant():
     assert free == [0]
     np.testing.assert_allclose(coupling[1:], 0)
     np.testing.assert_allclose(offset, [0, 0.4, 1.3])
+
+
+@pytest.mark.parametrize(("ratio", "offset", "low", "high"), [
+    (0.5, 0.3, 0.1, 0.7), (-2.0, 1.0, -0.2, 0.6), (1.0, 0.0, -1.0, 3.0)])
+def test_a_joint_moves_as_far_as_its_follower_stays_within_limits(
+    tmp_path: Path, ratio: float, offset: float, low: float, high: float
+) -> None:
+    follows = (f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/>'
+               f'<mimic joint="a" multiplier="{ratio}" offset="{offset}"/>')
+    text = claw(joints=joint("a", "palm", "left", "0 0 0.01") + joint("b", "left", "right", "0 0 0.06", more=follows))
+    tree = load_description(written(tmp_path, text)).tree
+    ways = np.linspace(0, 1.5, 15_001)  # those of joint a
+    kept = ways[(ratio * ways + offset >= low - 1e-9) & (ratio * ways + offset <= high + 1e-9)]
+    assert (float(tree.lower), float(tree.upper)) == pytest.approx((kept.min(), kept.max()), abs=2e-4)
 
 
 @pytest.mark.parametrize("rules", [(Coupling(0, 0, 1, 0),), (Coupling(0, 1, 1, 0), Coupling(1, 2, 1, 0), Coupling(2, 0, 1, 0))])

@@ -56,8 +56,8 @@ def test_links_are_described_at_their_point_nearest_to_a_ball(ball: ObjectModel,
     found = features(ball, grasps)
     radius = float(np.linalg.norm(ball.vertices, axis=1).mean())
     points = HAND.points(grasps.joints, grasps.T_object_wrist)
-    squeeze = pregrasp_and_squeeze(HAND, grasps.T_object_wrist, grasps.joints, torch.zeros(3))[1]
-    after = HAND.points(squeeze, grasps.T_object_wrist)
+    before, after = (HAND.points(joints, grasps.T_object_wrist) for joints in pregrasp_and_squeeze(
+        HAND, grasps.T_object_wrist, grasps.joints, torch.zeros(3)))
     links, checked = HAND.link_index.unique().tolist(), 0
     widths = [feature.width for feature in LINK_FEATURES.values()]
     assert found.links.shape == (6, len(links), sum(widths))
@@ -83,6 +83,8 @@ def test_links_are_described_at_their_point_nearest_to_a_ball(ball: ObjectModel,
             closing = after[i, HAND.link_index == link][which] - own[which]
             torch.testing.assert_close(axes @ told["closing vector"] * MOTION, closing, atol=1e-4, rtol=0)
             assert float(told["closing"]) * MOTION == pytest.approx(-float(closing @ normal), abs=1e-4)
+            arriving = own[which] - before[i, HAND.link_index == link][which]
+            assert float(told["arriving"]) * MOTION == pytest.approx(-float(arriving @ normal), abs=1e-4)
             assert bool(told["palm"]) == (link == HAND.palm)
     assert checked > 12
 
