@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.builtin import BUILTIN, box, frustum, hollow, make_builtin, ring, superquadric
+from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.catalogue import load_object, object_names, processed_objects, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.solids import box, frustum, hollow, ring, superquadric
 from dro_grasp.objects.surface_distances import signed_distances
 from tests.helpers.bench_clone import clone_of_bars
 
