@@ -123,8 +123,7 @@ def ring(radius: float, thickness: float, corners: int = 16, arc: float = 2 * np
                           thickness * np.sin(t)) for t in tube]), axis) + at
         for s in angles
     ]
-    segments = list(pairwise([*loops, loops[0]] if closed else loops))
-    return Solid(_swept(loops, closed), [hull(np.concatenate(pair)) for pair in segments])
+    return swept(loops, closed)
 
 
 def tilted(part: trimesh.Trimesh, angle: float) -> trimesh.Trimesh:
@@ -204,10 +203,11 @@ def circle(radius: float, corners: int = 24) -> Loop:
     return arc((radius, radius), (0, 360), corners, closed=True)
 
 
-def arc(radii: tuple[float, float], span: tuple[float, float], count: int, closed: bool = False) -> Loop:
+def arc(radii: tuple[float, float], span: tuple[float, float], count: int, at: tuple[float, float] = (0, 0),
+        closed: bool = False) -> Loop:
     """Points on an ellipse of half axes [m] between two angles [degree]; closed leaves out the last, which is the first."""
     angle = np.radians(np.linspace(*span, count, endpoint=not closed))
-    return np.stack([np.cos(angle), np.sin(angle)], 1) * radii
+    return np.stack([np.cos(angle), np.sin(angle)], 1) * radii + at
 
 
 def rectangle(half: tuple[float, float], radius: float = 0.0, corner: int = 1) -> Loop:

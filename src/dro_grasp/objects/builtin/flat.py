@@ -5,7 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from dro_grasp.objects.builtin.construction import HARD_TEST, HARD_TRAIN, PORCELAIN, BuiltinObject
-from dro_grasp.objects.solids import Pieces, arc, bar, box, circle, frustum, hull, rectangle, slab, upright, vessel, washer
+from dro_grasp.objects.solids import (
+    Pieces,
+    arc,
+    bar,
+    box,
+    circle,
+    frustum,
+    hull,
+    placed,
+    rectangle,
+    slab,
+    upright,
+    vessel,
+    washer,
+)
 
 
 def _ruler() -> Pieces:
@@ -27,7 +41,7 @@ def _chopping_board() -> Pieces:
     """A board, and a handle with a hole."""
     outer = rectangle((0.012, 0.018), 0.022, 5)
     hole = arc((0.012, 0.016), (9, 369), 20, closed=True)
-    grip = washer(outer + (0.145, 0), hole + (0.145, 0), -0.008, 0.008)
+    grip = placed(washer(outer, hole, -0.008, 0.008), (0.145, 0, 0))
     return [slab(rectangle((0.105, 0.07), 0.015, 4), -0.008, 0.008), grip]
 
 
@@ -38,7 +52,7 @@ def _dinner_plate() -> Pieces:
 def _hardcover_book() -> Pieces:
     """Pages between two covers that stand out on three sides, and a round back."""
     covers = [box((0.147, 0.215, 0.003), (0, 0, side * 0.0125)) for side in (1, -1)]
-    back = arc((0.006, 0.014), (90, 270), 9) + (-0.071, 0)
+    back = arc((0.006, 0.014), (90, 270), 9, (-0.071, 0))
     spine = hull(np.concatenate([upright(back, (0, y, 0)) for y in (-0.1075, 0.1075)]))
     return [*covers, box((0.14, 0.205, 0.0242), (-0.0015, 0, 0)), spine]
 

@@ -15,7 +15,7 @@ def _iron_ingot() -> Pieces:
 
 def _kettlebell() -> Pieces:
     """A ball that stands on a foot, with a handle above."""
-    handle = np.concatenate([[(0.036, 0.025)], arc((0.045, 0.028), (-10, 190), 9) + (0, 0.08), [(-0.036, 0.025)]])
+    handle = np.concatenate([[(0.036, 0.025)], arc((0.045, 0.028), (-10, 190), 9, (0, 0.08)), [(-0.036, 0.025)]])
     return [superquadric((0.047, 0.047, 0.047), (1, 1)), frustum((0.032, 0.036), (-0.047, -0.028)),
             bar(upright(handle), circle(0.011, 10), up=(0, 1, 0))]
 

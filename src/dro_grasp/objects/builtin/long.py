@@ -53,21 +53,20 @@ def _ballpoint_pen() -> Pieces:
 def _flute() -> Pieces:
     keys = [frustum((0.0075, 0.0075), (0.0075, 0.0125), (x, 0, 0), corners=12) for x in np.linspace(-0.02, 0.26, 10)]
     rod = frustum((0.002, 0.002), (-0.03, 0.27), (0, 0.0105, 0.004), axis="x", corners=8)
-    return [frustum((0.0095, 0.0095), (-0.33, 0.33), axis="x"), superquadric((0.019, 0.012, 0.004), (0.6, 0.8), (-0.24, 0, 0.009)),
-            rod, *keys]
+    lip_plate = superquadric((0.019, 0.012, 0.004), (0.6, 0.8), (-0.24, 0, 0.009))
+    return [frustum((0.0095, 0.0095), (-0.33, 0.33), axis="x"), lip_plate, rod, *keys]
 
 
 def _table_fork() -> Pieces:
     handle = spar([(-0.105, 0.014, 0.002, 0.0), (-0.09, 0.02, 0.0025, 0.001), (-0.01, 0.0075, 0.0035, 0.009),
                    (0.03, 0.008, 0.0035, 0.006), (0.046, 0.023, 0.002, -0.001), (0.06, 0.024, 0.002, -0.003)])
-    tines = [placed(tine, (0, y, 0)) for y in (-0.0104, -0.0035, 0.0035, 0.0104)
-             for tine in spar([(0.0585, 0.0032, 0.002, -0.0029), (0.085, 0.003, 0.0018, -0.003), (0.105, 0.0014, 0.001, 0.004)])]
-    return [*handle, *tines]
+    tine = spar([(0.0585, 0.0032, 0.002, -0.0029), (0.085, 0.003, 0.0018, -0.003), (0.105, 0.0014, 0.001, 0.004)])
+    return [*handle, *(placed(part, (0, y, 0)) for y in (-0.0104, -0.0035, 0.0035, 0.0104) for part in tine)]
 
 
 def _scissors() -> Pieces:
     """Closed scissors: of each half the blade on one side of the pivot, and the loop on the other."""
-    blade = np.array([(0.095, -0.003), (0.09, 0.0025), (0.0, 0.009), (-0.014, 0.003), (-0.014, -0.005), (0.0, -0.008)])
+    blade = np.array([(0.096, -0.001), (0.09, 0.0022), (0.0, 0.009), (-0.014, 0.003), (-0.014, -0.005), (0.0, -0.008)])
     pieces = [frustum((0.005, 0.005), (-0.0035, 0.0035), corners=16)]
     for side in (1, -1):
         low, high = sorted((-0.0002 * side, 0.002 * side))

@@ -32,7 +32,7 @@ def _wire_stand() -> Pieces:
 def _toast_rack() -> Pieces:
     """Six arches between two runners, and a ring on top to hold it by."""
     section = circle(0.0025, 8)
-    line = np.concatenate([[(0.045, 0.0)], arc((0.045, 0.035), (0, 180), 9) + (0, 0.06), [(-0.045, 0.0)]])
+    line = np.concatenate([[(0.045, 0.0)], arc((0.045, 0.035), (0, 180), 9, (0, 0.06)), [(-0.045, 0.0)]])
     arches = [bar(upright(line, (x, 0, 0), "y"), section, up=(1, 0, 0)) for x in np.linspace(-0.075, 0.075, 6)]
     rods = [frustum((0.0028, 0.0028), (-0.09, 0.09), at, axis="x", corners=8)
             for at in ((0, 0.045, 0.003), (0, -0.045, 0.003), (0, 0, 0.095))]
