@@ -21,7 +21,7 @@ from jaxtyping import Float
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.builtin import BUILTIN
+from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
@@ -105,7 +105,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hands", nargs="+", default=["allegro", "barrett"])
-    parser.add_argument("--objects", nargs="+", default=list(BUILTIN), help="all built-in ones by default")
+    parser.add_argument("--objects", nargs="+", default=list(OBJECTS), help="the usual built-in ones by default")
     parser.add_argument("--source", choices=(AUTO, *source_names()), default=AUTO)
     parser.add_argument("--num", type=int, default=16, help="grasps that are asked for")
     parser.add_argument("--trials", action="store_true", help=f"also evaluate under {PROTOCOL}")

@@ -9,13 +9,15 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.builtin import BUILTIN, box, frustum, hollow, make_builtin, ring, superquadric
+from dro_grasp.objects.builtin import BUILTIN, make_builtin
+from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object, object_names, processed_objects, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.solids import box, frustum, hollow, ring, superquadric
 from dro_grasp.objects.surface_distances import signed_distances
 from tests.helpers.bench_clone import clone_of_bars
 
-NAMES = list(BUILTIN)
+NAMES = list(OBJECTS)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def inside_parts(parts: tuple, points: np.ndarray) -> np.ndarray:
 
 
 def test_enough_builtins_in_both_splits():
-    splits = [kind.split for kind in BUILTIN.values()]
+    splits = [kind.split for kind in OBJECTS.values()]
     assert len(splits) >= 36
     assert splits.count("train") >= 28
     assert splits.count("test") >= 8
@@ -68,7 +70,7 @@ def test_builtin_is_a_sound_solid_of_graspable_size(name: str, builtins: dict[st
     assert mesh.is_volume
     assert mesh.body_count == 1
     assert obj.notes == ()
-    assert obj.split == BUILTIN[name].split
+    assert obj.split == OBJECTS[name].split
     assert obj.volume == pytest.approx(mesh.volume)
     assert 0.05 <= obj.extents.max() <= 0.2
     assert 0.02 < obj.extents.min() < 0.101

@@ -8,8 +8,9 @@ import trimesh
 from scipy.spatial import Delaunay
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.builtin import FAMILIES, SIZE, THINNEST, Solid, procedural_object
 from dro_grasp.objects.catalogue import load_object, locate_object, resolve_objects
+from dro_grasp.objects.procedural import FAMILIES, SIZE, THINNEST, procedural_object
+from dro_grasp.objects.solids import Solid
 from dro_grasp.training.data.engine.schedule import require_distinct, require_known
 
 SEEDS = range(16)

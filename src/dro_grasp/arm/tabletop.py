@@ -39,7 +39,7 @@ from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
-from dro_grasp.objects.builtin import BUILTIN
+from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import ObjectModel
@@ -264,8 +264,8 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
 
 
 def other_objects(name: str, count: int, draw: np.random.Generator) -> list[ObjectModel]:
-    """Some of the built-in objects, without the one that is asked for."""
-    return [load_object(str(other)) for other in draw.permutation(sorted(set(BUILTIN) - {name}))[:count]]
+    """Some of the usual built-in objects, without the one that is asked for."""
+    return [load_object(str(other)) for other in draw.permutation(sorted(set(OBJECTS) - {name}))[:count]]
 
 
 def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:

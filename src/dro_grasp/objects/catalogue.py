@@ -17,9 +17,10 @@ import trimesh
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.kinds import checked
-from dro_grasp.objects.builtin import BUILTIN, PROCEDURAL, make_builtin, procedural_object
+from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import check_scale, load_file, mesh_object, object_in_memory
+from dro_grasp.objects.procedural import PROCEDURAL, procedural_object
 from dro_grasp.objects.reading import ObjectSource, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 

@@ -17,7 +17,7 @@ from dro_grasp.objects.cache import cached_arrays, content_hash
 from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
-DENSITY = 500.0  # Density of every object in trials [kg/m^3]. Source: the official release
+DENSITY = 500.0  # Density of every object that states none [kg/m^3]. Source: the official release
 CLOUD_POINTS = 16384  # Points of an object's stored cloud (ours)
 BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
@@ -66,6 +66,8 @@ class ObjectModel:
     """The file it was loaded from, if it is a user's own."""
     scale: float = 1.0
     """Factor that the file's coordinates were multiplied by."""
+    density: float = DENSITY
+    """Mass over volume [kg/m^3]."""
 
     def __repr__(self) -> str:
         size = " x ".join(f"{100 * side:.1f}" for side in self.extents)
@@ -79,8 +81,8 @@ class ObjectModel:
 
     @property
     def mass(self) -> float:
-        """Mass at a density of 500 kg/m^3 [kg]."""
-        return DENSITY * self.volume
+        """Mass [kg]; it is spread evenly over the volume."""
+        return self.density * self.volume
 
     @property
     def extents(self) -> Float[np.ndarray, "3"]:
@@ -107,7 +109,9 @@ class ObjectModel:
 
         One mesh may have other parts: a built-in object's are exact, those of the same mesh in a user's file are cut.
         """
-        mass = np.array([self.volume, *self.centre_of_mass, *self.inertia.ravel()])
+        # The usual density is left out: hashes in files of before densities could be stated stay what they are.
+        own = [] if self.density == DENSITY else [self.density]
+        mass = np.array([self.volume, *self.centre_of_mass, *self.inertia.ravel(), *own])
         if self.balls is not None:
             solid = [self.balls.centres.numpy(), self.balls.radii.numpy()]
         else:
