@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
@@ -49,10 +49,22 @@ class SettleConfig(Checked):
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    giving_worth: float = 3.0
+    """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
+
+
+GIVES, TURNS = 0.02, math.radians(15)
+"""How far a load may move [m] and turn [rad] what is held. Ours: as under `carry`."""
+
+
+def giving(state: GraspState) -> Float[Tensor, " n"]:
+    """How far the weight moves or turns the object, of what it may; 0 where it was not tried, at most 2."""
+    share = torch.maximum(state.gave[:, 0] / GIVES, state.gave[:, 1] / TURNS)
+    return share.nan_to_num(0.0).clamp_max(2.0)
 
 
 class Settled(NamedTuple):
@@ -93,7 +105,7 @@ def settle_best(
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = scored(problem, closed, score).score
-    found[stable] = holding_score(found[stable], state)
+    found[stable] = holding_score(found[stable], state) - config.giving_worth * giving(state)
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
@@ -123,12 +135,10 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    (state, torques), depth = grasp_state(hand, obj, better, config=config.weight), deepest_penetration(hand, obj, better)
+    (state, squeeze), depth = grasp_state(hand, obj, better, config=config.weight), deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    unit = hand.tree.joint_unit**2 / config.refinement.grip.stiffness
-    pressed = (better.squeeze_joints + torques * unit).clamp(hand.tree.lower, hand.tree.upper)
-    better = better.replace(squeeze_joints=pressed)
+    better = better.replace(squeeze_joints=squeeze)
     return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
 
 

@@ -5,7 +5,7 @@ Nothing pushes the object here, so this is no trial; it tells a squeeze that sli
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
@@ -19,9 +19,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.outcome import FORCES
+from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, quiet, rollouts
+from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, quiet, rollouts
 from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
@@ -34,6 +34,7 @@ BEARS = 0.05  # Normal force of a contact above which its slip counts [N] (ours)
 EDGES = 6  # Edges of a friction cone (ours)
 RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
 SMALLEST = 1e-3  # Weight of the squared forces beside the weight that they hold (ours)
+PAIRS = ("unanswered", "gave")  # Fields of two columns
 STEPS = 80  # Steps of the solver (ours)
 NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)
 
@@ -52,6 +53,8 @@ class GraspState(Rows):
     slip: Float[Tensor, " n"]  # largest ratio of tangential to normal force at a contact that bears; NO_ANSWER without one
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
+    gave: Float[Tensor, "n 2"]
+    """How far the weight then moves the object [m] and turns it [rad], whichever way it pulls; NaN where it was not tried."""
 
 
 @dataclass(frozen=True)
@@ -83,21 +86,35 @@ def grasp_state(
 ) -> tuple[GraspState, Float[Tensor, "n n_dof"]]:
     """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`.
 
-    The second result are the torques that joints add so that the contacts hold the object's weight (see `weight_torques`).
+    The second result are squeezes that press for the object's weight, too (see `weight_torques`).
     """
-    scene = scene_of(hand, obj, grasps, protocol)
-    none = {f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(GraspState)}
-    parts, torques = [GraspState(**none)], [grasps.joints[:0]]
-    for _, rollout in rollouts(scene, hand, grasps, workers):
-        state, found = _observed(rollout)
-        parts.append(state)
+    scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
+    none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
+    parts, squeezes = [GraspState(**none)], [grasps.joints[:0]]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
+        closed, state, found = _observed(rollout)
         joints = torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
-        torques.append(weight_torques(hand, found, joints, torch.from_numpy(rollout.mass).to(joints), config))
+        torques = weight_torques(hand, found, joints, torch.from_numpy(rollout.mass).to(joints), config)
+        offset = torques * hand.tree.joint_unit**2 / config.stiffness
+        squeezes.append((part.squeeze_joints + offset).clamp(hand.tree.lower, hand.tree.upper))
+        parts.append(replace(state, gave=_pulled(rollout, closed, squeezes[-1], config)))
     state = GraspState(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(GraspState)})
-    return state, torch.cat(torques)
+    return state, torch.cat(squeezes)
 
 
-def _observed(rollout: Rollout) -> tuple[GraspState, list[ContactForces]]:
+def _pulled(rollout: Rollout, closed: ObjectState, squeeze: Float[Tensor, "n n_dof"], config: WeightConfig) -> Float[Tensor, "n 2"]:
+    """How far pulls move and turn the object while the hand presses for its weight."""
+    if config.pull == 0:
+        return torch.full((rollout.size, 2), torch.nan)
+    pressed = rollout.press(squeeze.numpy()[:, rollout.scene.actuated], config.pressing)
+    alive = pressed.stable & (pressed.shift(closed) < LOST_DISTANCE)
+    pulls = Pulls(config.pull * config.gravity, config.pulling, reset=True)
+    moved, turned, _ = rollout.push(pressed, alive, pulls)
+    gave = np.stack([np.nan_to_num(moved, nan=LOST_DISTANCE).max(1), np.nan_to_num(turned, nan=np.pi).max(1)], 1)
+    return torch.from_numpy(gave).float()
+
+
+def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, list[ContactForces]]:
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
@@ -112,7 +129,7 @@ def _observed(rollout: Rollout) -> tuple[GraspState, list[ContactForces]]:
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
     missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction)
-    return GraspState(**values, unanswered=missing), found
+    return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan)), found
 
 
 def _contacts(rollout: Rollout) -> list[ContactForces]:
@@ -163,6 +180,14 @@ class WeightConfig(Checked):
     """Edges of a friction cone."""
     iterations: int = 100
     """Steps of the solver."""
+    stiffness: float = 3.0
+    """Stiffness of the servos [Nm/rad]; a squeeze is the torque over it."""
+    pull: float = 1.0
+    """Multiple of the weight that then pulls along six directions; 0 does not try."""
+    pressing: float = 0.2
+    """Time for which the hand presses before [s]."""
+    pulling: float = 0.3
+    """Time of each pull [s]."""
 
 
 def weight_torques(

@@ -102,6 +102,16 @@ class ObjectState(Rows):
         return np.arctan2(sine, np.trace(relative, axis1=1, axis2=2) - 1)
 
 
+@dataclass(frozen=True)
+class Pulls:
+    """Forces on the object along six directions, one after the other."""
+
+    acceleration: float  # force per mass of the object [m/s^2]
+    seconds: float  # duration of each [s]
+    reset: bool  # whether each starts where the first one started; otherwise where the one before ended
+    from_start: bool = False  # whether motion counts from the labelled grasp, not from where the first one started
+
+
 class Rollout:
     """Trials of several grasps side by side; each hand waits at its start."""
 
@@ -145,26 +155,33 @@ class Rollout:
                 self._advance(everyone, steps // (RAMP * (len(self.targets) - 1)))
         return self.observe()
 
+    def press(self, targets: Float[np.ndarray, "n n_servos"], seconds: float) -> ObjectState:
+        """Move on to other targets for a time [s]."""
+        self.ctrl[:] = targets
+        self._advance(np.arange(self.size), self._steps(seconds))
+        return self.observe()
+
     def push(
-        self, closed: ObjectState, alive: Bool[np.ndarray, " n"]
+        self, closed: ObjectState, alive: Bool[np.ndarray, " n"], pulls: Pulls | None = None
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:
-        """Apply all forces in turn to the trials that are alive; a lost object is left alone.
+        """Apply all forces in turn to the trials that are alive; a lost object is left alone. Forces are the protocol's.
 
         Displacement [m] and rotation [rad] after each force, NaN where none was applied; whether the simulation stayed sound.
         """
         displacement, rotation = np.full((self.size, 6), np.nan), np.full((self.size, 6), np.nan)
         stable, alive = closed.stable.copy(), alive & closed.stable
         rules = self.scene.protocol
-        origin = self.start if rules.reset else closed
-        state = {name: np.array(self.batch.bind(name)) for name in STATE} if rules.reset else {}
+        pulls = pulls or Pulls(rules.force, rules.force_time, rules.reset, from_start=rules.reset)
+        origin = self.start if pulls.from_start else closed
+        state = {name: np.array(self.batch.bind(name)) for name in STATE} if pulls.reset else {}
         for k, axis in enumerate(FORCES):
             rows = np.flatnonzero(alive)
             if not len(rows):
                 break
             for name, values in state.items():
                 self.batch.bind(name)[rows] = values[rows]
-            self._set_force(axis, rows)
-            self._advance(rows, self._steps(rules.force_time))
+            self._set_force(axis * pulls.acceleration, rows)
+            self._advance(rows, self._steps(pulls.seconds))
             now = self.observe(rows)
             # Later columns keep these values unless the trial goes on.
             displacement[rows, k:] = now.shift(origin.rows(rows))[:, None]
@@ -208,11 +225,9 @@ class Rollout:
     def _steps(self, seconds: float) -> int:
         return round(seconds / self.scene.protocol.timestep)
 
-    def _set_force(self, axis: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
-        """Apply the force along an axis of the object's frame, as the object was oriented at the start."""
-        rules = self.scene.protocol
-        newtons = rules.force * self.mass[rows, None]
-        self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
+    def _set_force(self, acceleration: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
+        """Apply a force per mass [m/s^2] in the object's frame, as the object was oriented at the start."""
+        self.force[rows, self.scene.object_body, :3] = self.mass[rows, None] * (self.start.rotation[rows] @ acceleration)
 
     def _advance(self, rows: Int[np.ndarray, " k"], steps: int) -> None:
         """Let time pass in some of the trials, and record it if asked to; recording does not change the motion."""
