@@ -121,7 +121,7 @@ def table(columns: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
     """Markdown; a column that is empty everywhere is left out."""
     filled = [i for i, _ in enumerate(columns) if i == 0 or any(str(line[i]) for line in lines)]
     columns, lines = [columns[i] for i in filled], [[line[i] for i in filled] for line in lines]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (columns, ["---"] * len(columns), *lines))
+    return "\n".join(f"|{'|'.join(map(str, line))}|" for line in (columns, ["---"] * len(columns), *lines))
 
 
 PROTOCOLS = ("dro", "strict", "dexgraspbench", "robust")
@@ -288,7 +288,7 @@ def data_card(results: Results) -> str:
 def commands(results: Results) -> str:
     """Whole commands, from shell to file."""
     told = {k: v for k, v in results.cell("speed", "commands").items() if isinstance(v, float)}
-    return table(["command", "median [s]"], [[f"`{name}`", f"{seconds:.1f}"] for name, seconds in told.items()])
+    return table(["command", "median [s]"], [[name, f"{seconds:.2g}"] for name, seconds in told.items()])
 
 
 def parts(results: Results) -> str:
