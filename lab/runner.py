@@ -69,6 +69,8 @@ def main(argv: list[str] | None = None) -> int:
     if changed := uncommitted():
         parser.error(f"uncommitted changes would be measured as if they were a commit: {', '.join(changed[:5])}; commit them")
     jobs = [job for name, m in chosen.items() if at_hand(m) for job in jobs_of(name, m) if options.again or reason(job)]
+    if not jobs:
+        print("nothing is missing or older than its code")
     return run(jobs, options.workers)
 
 

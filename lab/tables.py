@@ -97,14 +97,12 @@ def _numbers(value: Any) -> Any:
 
 def mixed(used: dict[str, Cell]) -> list[str]:
     """In what the results of one table differ that should be of one state."""
-    found = []
-    for what in ("weights", "code"):
-        states: dict[str, set[str]] = {}
-        for cell in used.values():
-            for name, digest in cell[what].items():
-                states.setdefault(name, set()).add(digest)
-        found += [f"{what} of {name}" for name, digests in states.items() if len(digests) > 1]
-    return found
+    found = ["weights"] if len({json.dumps(cell["weights"], sort_keys=True) for cell in used.values()}) > 1 else []
+    states: dict[str, set[str]] = {}
+    for cell in used.values():
+        for name, digest in cell["code"].items():  # measurements rest on different parts
+            states.setdefault(name, set()).add(digest)
+    return found + [f"code of {name}" for name, digests in states.items() if len(digests) > 1]
 
 
 def percent(rate: Sequence[float]) -> str:
@@ -121,7 +119,7 @@ def table(columns: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
     """Markdown; a column that is empty everywhere is left out."""
     filled = [i for i, _ in enumerate(columns) if i == 0 or any(str(line[i]) for line in lines)]
     columns, lines = [columns[i] for i in filled], [[line[i] for i in filled] for line in lines]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (columns, ["---"] * len(columns), *lines))
+    return "\n".join(f"|{'|'.join(map(str, line))}|" for line in (columns, ["---"] * len(columns), *lines))
 
 
 PROTOCOLS = ("dro", "strict", "dexgraspbench", "robust")
@@ -288,7 +286,7 @@ def data_card(results: Results) -> str:
 def commands(results: Results) -> str:
     """Whole commands, from shell to file."""
     told = {k: v for k, v in results.cell("speed", "commands").items() if isinstance(v, float)}
-    return table(["command", "median [s]"], [[f"`{name}`", f"{seconds:.1f}"] for name, seconds in told.items()])
+    return table(["command", "median [s]"], [[name, f"{seconds:.2g}"] for name, seconds in told.items()])
 
 
 def parts(results: Results) -> str:
