@@ -105,7 +105,9 @@ def settle_best(
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = scored(problem, closed, score).score
-    found[stable] = holding_score(found[stable], state) - config.giving_worth * giving(state)
+    held = holding_score(found[stable], state)
+    # What gives way under its weight is still better than what does not even hold still.
+    found[stable] = torch.maximum(held - config.giving_worth * giving(state), config.unstable_score + held.sigmoid())
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)

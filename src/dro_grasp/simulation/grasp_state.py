@@ -102,7 +102,9 @@ def grasp_state(
     return state, torch.cat(squeezes)
 
 
-def _pulled(rollout: Rollout, closed: ObjectState, squeeze: Float[Tensor, "n n_dof"], config: WeightConfig) -> Float[Tensor, "n 2"]:
+def _pulled(
+    rollout: Rollout, closed: ObjectState, squeeze: Float[Tensor, "n n_dof"], config: WeightConfig
+) -> Float[Tensor, "n 2"]:
     """How far pulls move and turn the object while the hand presses for its weight."""
     if config.pull == 0:
         return torch.full((rollout.size, 2), torch.nan)
@@ -180,6 +182,8 @@ class WeightConfig(Checked):
     """Edges of a friction cone."""
     iterations: int = 100
     """Steps of the solver."""
+    missing: float = 0.3
+    """Share of the weight that may stay without answer; where more does, pressing harder only ejects the object."""
     stiffness: float = 3.0
     """Stiffness of the servos [Nm/rad]; a squeeze is the torque over it."""
     pull: float = 1.0
@@ -197,7 +201,7 @@ def weight_torques(
     """Torques by which joints press so that contacts hold the weight along each axis and against it [Nm or N].
 
     For each way of gravity, the least forces within the friction cones that balance the weight; their mean balances itself,
-    and each contact presses in it for its share of whichever weight there is.
+    and each contact presses in it for its share of whichever weight there is. Where contacts cannot hold it, nothing is added.
     """
     config, n = config or WeightConfig(), len(contacts)
     if config.margin == 0 or n == 0:
@@ -215,8 +219,10 @@ def weight_torques(
     pulls = torch.as_tensor(FORCES).to(joints)
     goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).repeat(n, 1)
     amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, SMALLEST, config.iterations)
+    missing = ((wrench.repeat_interleave(len(pulls), 0) @ amounts[..., None])[..., 0] - goal).norm(dim=-1)
+    able = missing.reshape(n, len(pulls)).amax(1) < config.missing
     mean = amounts.unflatten(0, (n, len(pulls))).mean(1).unflatten(1, (k, config.edges))
-    force = config.margin * config.gravity * mass[:, None, None] * (mean[..., None] * cone).sum(-2)
+    force = (config.margin * config.gravity * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
     jacobian = torch.stack([
         tree.point_jacobian(pose, p, at) for pose, p, at in zip(tree.forward(joints), point, link.clamp_min(0), strict=True)])
     return torch.einsum("nkc,nkcd->nd", force, jacobian) * hand.movable
