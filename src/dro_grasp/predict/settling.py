@@ -49,6 +49,8 @@ class SettleConfig(Checked):
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    protocol: str = "carry"
+    """Physics of the second closing, and of the pulls after it."""
     giving_worth: float = 3.0
     """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
     weight: WeightConfig = field(default_factory=WeightConfig)
@@ -137,7 +139,7 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    (state, squeeze), depth = grasp_state(hand, obj, better, config=config.weight), deepest_penetration(hand, obj, better)
+    (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
     better = better.replace(squeeze_joints=squeeze)
