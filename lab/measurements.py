@@ -1,7 +1,7 @@
 """What is measured for a release: named measurements, each of which is some commands that print one JSON object.
 
-`python -m lab.runner` runs them, `python -m lab.tables` writes what README and docs tell of them. Nothing in the package was
-chosen by what is measured here.
+`python -m lab.runner` runs them, `python -m lab.tables` writes what README and docs tell of them. Nothing may be chosen by what
+is measured here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowh
 UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgripper", "assets/orca")
 """Hands that no weights were trained on."""
 OBJECTS = {"validate": "assets:validate", "test": "builtin:test"}
-"""Objects that no weights were trained on and by which nothing was chosen: the paper's and the built-in ones."""
+"""Objects that no weights were trained on: the paper's, by which the form of the network was once chosen, and built-in ones."""
 MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")

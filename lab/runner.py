@@ -107,13 +107,13 @@ def differing(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
 
 
 def tell_stale(chosen: Mapping[str, Measurement]) -> int:
-    """Say of each measurement what is missing or stale; 1 if anything is."""
+    """Say of each measurement what is missing or stale; 1 if anything is that the machine could measure."""
     stale = False
     for name, measurement in chosen.items():
         reasons = [why for job in jobs_of(name, measurement) if (why := reason(job))]
         note = "" if at_hand(measurement) else f" (needs {measurement.device})"
         print(f"{name}: {f'{len(reasons)} of {len(measurement.cells)} commands, {reasons[0]}' if reasons else 'fresh'}{note}")
-        stale |= bool(reasons)
+        stale |= bool(reasons) and at_hand(measurement)
     return int(stale)
 
 

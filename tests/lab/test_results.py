@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -140,3 +141,20 @@ def test_code_counts_by_its_syntax_without_docstrings(tmp_path: Path, monkeypatc
         hashes.append(runner.code_hash("m.py"))
     runner.code_hash.cache_clear()
     assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_changes_of_code_count_as_uncommitted_and_results_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "ROOT", tmp_path)
+    for name in ("src/a.py", "lab/b.py", "lab/results/c.json", "lab/notebook/d.md", "docs/e.md"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("1\n")
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    for arguments in (["init", "-q"], ["add", "-A"], [*identity, "commit", "-qm", "first"]):
+        subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
+    assert runner.uncommitted() == []
+    for name in ("lab/results/c.json", "lab/notebook/d.md", "docs/e.md"):
+        (tmp_path / name).write_text("2\n")
+    assert runner.uncommitted() == []
+    (tmp_path / "src/a.py").write_text("2\n")
+    (tmp_path / "lab/new.py").write_text("2\n")
+    assert sorted(runner.uncommitted()) == ["lab/new.py", "src/a.py"]
