@@ -170,7 +170,7 @@ def link_of_body(scene: TrialScene) -> Int[np.ndarray, " n_bodies"]:
 class WeightConfig(Checked):
     """How hard fingers press for the object's weight (ours)."""
 
-    margin: float = 2.0
+    margin: float = 1.5
     """Multiple of the weight that is held whichever way gravity pulls; 0 squeezes light and heavy things alike."""
     gravity: float = 9.81
     """[m/s^2]"""
