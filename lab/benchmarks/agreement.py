@@ -1,6 +1,6 @@
 """How many outcomes of trials stay the same with finer time steps and other settings of the solver.
 
-    python -m lab.benchmarks.agreement [--hands HAND ...] [--objects NAME ...] [--num N] [--protocols NAME ...] [--seed 0] [--json]
+    python -m lab.benchmarks.agreement [--hands HAND ...] [--objects NAME ...] [--num N] [--protocols NAME ...] [--json]
 
 Grasps are the network's, refined and settled, all of them: the best alone hold nearly always, and would agree for that reason.
 So both outcomes occur, and `kappa` says how far the agreement is beyond that of chance.

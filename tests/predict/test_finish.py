@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from dataclasses import replace
 
@@ -59,7 +60,10 @@ def naive(problem: GraspProblem, made: Candidates, keep: int) -> tuple[GraspBatc
     done = GraspBatch.concatenate([pose.without("score") for pose in poses])
     values = scored(problem, done).score
     after = values.clone()
-    after[stable] = holding_score(values[stable], state)
+    for row, held, (moved, turned) in zip(
+            stable.nonzero()[:, 0].tolist(), holding_score(values[stable], state).tolist(), state.gave.tolist(), strict=True):
+        given = min(max(moved / 0.02, math.degrees(turned) / 15), 2.0)
+        after[row] = max(held - 3 * given, 1 / (1 + math.exp(-held)) - 4)
     score = torch.tensor([float(after[i]) if bool(good[i]) else min(float(after[i]), -4.0) for i in range(len(better))])
     best = sorted(range(len(better)), key=lambda row: -float(score[row]))[:keep]
     chosen = done.replace(score=score)[torch.tensor(best, dtype=torch.long)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dro_grasp.compare.rows import Row
     from dro_grasp.objects.shape import ObjectModel
 
-QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
+QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("carry", "strict")}
 """What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
 
 
@@ -46,7 +46,7 @@ class Benchmark:
     """What is done to the grasps before the trials. refined and settled report all grasps, and the best by score. settled:
     refined grasps after their closing was simulated. returned: what `generate --source` returns. equal-time: every method
     gets as much CPU time a grasp as the first."""
-    protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
+    protocols: tuple[ProtocolName, ...] = ("carry", "dexgraspbench", "strict")
     """Protocols of the trials. Displacement, rotation and diversity are means over the successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights of the network.
     device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
@@ -58,7 +58,7 @@ class Benchmark:
     contact_quality: Flag = False
     """Also measure the analytic metrics of DexGraspBench, with its friction: penetration, contact distance, force closure."""
     quick: Flag = False
-    """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
+    """A first look: what the methods return, four grasps of each hand on the first two objects, under carry and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What methods, refinement and ranking see: the mesh (whole), its points (cloud), half of them as in the paper (half), or
     a depth image (depth)."""

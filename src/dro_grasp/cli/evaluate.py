@@ -28,7 +28,7 @@ SHARES = {"trials_held": "held", "fingers_in_contact": "fingers", "all_fingers_i
 class Evaluate:
     """Evaluate the grasps of a file in simulation and report success rates with 95 % intervals.
 
-    Example: dro-grasp evaluate grasps.parquet --protocol strict
+    Example: dro-grasp evaluate grasps.parquet --protocol robust
     """
 
     file: tyro.conf.Positional[Path]  # Grasp file, or a folder of them, as `generate` fills it for a folder of objects.

@@ -49,6 +49,8 @@ class SettleConfig(Checked):
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    closing: str = "strict"
+    """Physics of the first closing, which says where a grasp ends: fingers as strong as each other."""
     protocol: str = "carry"
     """Physics of the second closing, and of the pulls after it."""
     giving_worth: float = 3.0
@@ -133,13 +135,14 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     """
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
     grasps = complete(problem, grasps.without("score"))
-    closed = settle(hand, obj, grasps)
+    closed = settle(hand, obj, grasps, config.closing)
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=config.weight)
+    depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
     better = better.replace(squeeze_joints=squeeze)

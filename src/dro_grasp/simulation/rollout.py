@@ -180,7 +180,7 @@ class Rollout:
                 break
             for name, values in state.items():
                 self.batch.bind(name)[rows] = values[rows]
-            self._set_force(axis * pulls.acceleration, rows)
+            self._set_force(axis, pulls.acceleration, rows)
             self._advance(rows, self._steps(pulls.seconds))
             now = self.observe(rows)
             # Later columns keep these values unless the trial goes on.
@@ -225,9 +225,10 @@ class Rollout:
     def _steps(self, seconds: float) -> int:
         return round(seconds / self.scene.protocol.timestep)
 
-    def _set_force(self, acceleration: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
-        """Apply a force per mass [m/s^2] in the object's frame, as the object was oriented at the start."""
-        self.force[rows, self.scene.object_body, :3] = self.mass[rows, None] * (self.start.rotation[rows] @ acceleration)
+    def _set_force(self, axis: Float[np.ndarray, "3"], acceleration: float, rows: Int[np.ndarray, " k"]) -> None:
+        """Apply a force per mass [m/s^2] along an axis of the object's frame, as the object was oriented at the start."""
+        newtons = acceleration * self.mass[rows, None]
+        self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
 
     def _advance(self, rows: Int[np.ndarray, " k"], steps: int) -> None:
         """Let time pass in some of the trials, and record it if asked to; recording does not change the motion."""

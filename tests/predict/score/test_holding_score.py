@@ -27,7 +27,8 @@ FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "contacts": 9
 def held(**changes: float) -> GraspState:
     values = FIRM | changes
     worst = values.pop("worst", 0.4)
-    return GraspState(**{k: torch.tensor([v]) for k, v in values.items()}, unanswered=torch.tensor([[worst, 0.8 * worst]]))
+    pairs = {"unanswered": torch.tensor([[worst, 0.8 * worst]]), "gave": torch.zeros(1, 2)}
+    return GraspState(**{k: torch.tensor([v]) for k, v in values.items()}, **pairs)
 
 
 @pytest.mark.parametrize("worse", [
