@@ -9,6 +9,7 @@ So both outcomes occur, and `kappa` says how far the agreement is beyond that of
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -33,7 +34,6 @@ from lab.benchmarks.report import emit, rate
 
 CHANGES = {
     "1 ms": {"timestep": 0.001},
-    "2.5 ms": {"timestep": 0.0025},
     "friction ten times stiffer": {"impratio": 100.0},
     "residual slip removed longer": {"noslip": 10},
 }
@@ -58,6 +58,7 @@ def outcomes(options: argparse.Namespace) -> Iterator[dict[tuple[str, str], Bool
         hand = load_hand(name)
         for obj in map(load_object, resolve_objects(options.objects)):
             grasps = candidates(predictor, hand, obj, options.num, options.seed)
+            print(f"{hand.name} on {obj.name}", file=sys.stderr)
             yield {(p, setting): simulate(hand, obj, grasps, replace(protocol(p), **change), workers=options.workers).success
                    for p in options.protocols for setting, change in {"its own": {}, **CHANGES}.items()}
 

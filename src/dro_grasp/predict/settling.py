@@ -61,8 +61,10 @@ class SettleConfig(Checked):
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
 
-GIVES, TURNS = 0.02, math.radians(15)
-"""How far a load may move [m] and turn [rad] what is held. Ours: as under `carry`."""
+GIVES = 0.02
+"""How far a load may move what is held [m]. Ours: as under `carry`."""
+TURNS = math.radians(15)
+"""How far a load may turn it [rad], likewise."""
 
 
 def giving(state: GraspState) -> Float[Tensor, " n"]:
