@@ -20,7 +20,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
-from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads
+from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, servo_torques
 from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
@@ -111,7 +111,7 @@ def _pressed(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> tuple[
             break
         targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
     reached = torch.from_numpy(rollout.poses()[0]).to(chosen.joints)
-    torque = replace(chosen, joints=reached).torques_at(targets[:, None])[:, 0]
+    torque = servo_torques(chosen.hand, reached, targets, chosen.stiffness)
     force = torch.tensor([c.pressure.sum() for c in found]).to(mass)
     return pressed, Squeeze(targets, torque, force, torch.full_like(force, torch.nan))
 
@@ -182,8 +182,9 @@ def squeezes_of(
     config: WeightConfig,
 ) -> Squeezes:
     """How closed hands squeeze for a mass: towards the base, and by the torques that hold its weight."""
-    touch = pressing(hand, contacts, joints, config.contacts)
-    force = weight_forces(touch, joints.new_ones(len(contacts)), config)
+    touch = pressing(hand, contacts, joints, max(config.contacts, config.payload.contacts))
+    force = weight_forces(touch.hardest(config.contacts), joints.new_ones(len(contacts)), config)
+    force = torch.nn.functional.pad(force, (0, 0, 0, touch.on.shape[1] - force.shape[1]))
     torques = torch.einsum("nkc,nkcd->nd", force, touch.jacobian)
     normal = (force * touch.normal).sum(-1)
     return Squeezes(hand, joints, base, torques, normal, touch, config.stiffness, config.max_force)
