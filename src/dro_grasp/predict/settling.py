@@ -7,7 +7,7 @@ the object, so this is no trial; it needs the hand's description. Balls stand fo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -15,16 +15,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.effort import find_efforts
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, renamed
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.score import ScoreConfig, holding_score
+from dro_grasp.predict.score.holding import Evidence, holding_score
+from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import GraspState, WeightConfig, grasp_state
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state
+from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import hand_shift, settle
 
 
@@ -37,8 +41,6 @@ class SettleConfig(Checked):
     """Share of scored candidates that are settled, the best ones; the others are left out."""
     clearance_worth: float = 80.0
     """What the score of a grasp on an object seen in part loses for clearance that the opened hand lacks [log-odds per m]."""
-    unstable_score: float = -4.0
-    """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding]."""
     still: float = 0.005
     """A grasp that moves the object less than this has settled; others are refined where they stand, and close again [m]."""
     lost: float = 0.05
@@ -51,30 +53,18 @@ class SettleConfig(Checked):
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
     protocol: str = "carry"
     """Physics of the second closing, and of the pulls after it."""
-    giving_worth: float = 3.0
-    """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
 
-GIVES, TURNS = 0.02, math.radians(15)
-"""How far a load may move [m] and turn [rad] what is held. Ours: as under `carry`."""
-
-
-def giving(state: GraspState) -> Float[Tensor, " n"]:
-    """How far the weight moves or turns the object, of what it may; 0 where it was not tried, at most 2."""
-    share = torch.maximum(state.gave[:, 0] / GIVES, state.gave[:, 1] / TURNS)
-    return share.nan_to_num(0.0).clamp_max(2.0)
-
-
 class Settled(NamedTuple):
-    """What became of n grasps, m of which hold still."""
+    """What became of n grasps."""
 
     grasps: GraspBatch  # all of them, in their order
     stable: Bool[Tensor, " n"]  # which ones hold still, with no link too deep in the object or in another
-    state: GraspState  # how these m hold the object
+    known: Evidence  # what closing showed of all of them
 
 
 def can_settle(problem: GraspProblem) -> bool:
@@ -82,15 +72,22 @@ def can_settle(problem: GraspProblem) -> bool:
     return problem.hand.description is not None
 
 
+class SettledBest(NamedTuple):
+    """The better share of n grasps."""
+
+    rows: Int[Tensor, " k"]  # which of the n they are
+    grasps: GraspBatch  # settled, with scores
+    doubts: tuple[str, ...]  # what closing showed against each, in words of DOUBTS; empty for nothing
+
+
 def settle_best(
     problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig | None = None,
     score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
-) -> tuple[Int[Tensor, " k"], GraspBatch]:
-    """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
+) -> SettledBest:
+    """The better share of scored grasps, settled and scored again, in their order.
 
-    The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A
-    grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
-    `unstable_score`.
+    The score counts what closing showed, and on an object seen in part the clearance that the opened hand leaves. A grasp that
+    does not hold still, or ends where the problem's constraints forbid, stays as it was and counts as unstable.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -103,17 +100,29 @@ def settle_best(
     config = config or SettleConfig()
     count = max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, stable, state = settle_grasps(problem, grasps[best], config)
+    closed, stable, known = settle_grasps(problem, grasps[best], config)
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
-    found = scored(problem, closed, score).score
-    held = holding_score(found[stable], state)
-    # What gives way under its weight is still better than what does not even hold still.
-    found[stable] = torch.maximum(held - config.giving_worth * giving(state), config.unstable_score + held.sigmoid())
-    found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
+    found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
-    return best, closed.replace(score=found)
+    return SettledBest(best, closed.replace(score=found), doubts(known, wrong, config))
+
+
+AWAY, DEEP = "push it away as they close", "reach into it"
+MOVES, TURNS = "move it as they close", "turn it as they close"
+FORBIDDEN, GIVES_WAY = "end where the constraints forbid", "give way under its weight"
+DOUBTS = (AWAY, DEEP, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
+"""What closing shows against a grasp, in the order in which the first is told."""
+
+
+def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> tuple[str, ...]:
+    """What closing showed against each grasp, in words; empty for nothing."""
+    rules, state = protocol(config.protocol), known.state
+    gives = (state.gave[:, 0] > rules.max_displacement) | (state.gave[:, 1] > rules.max_rotation)
+    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, MOVES: state.shift >= config.farthest,
+             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives}
+    return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
 def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
@@ -139,11 +148,19 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=config.weight)
+    depth = deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
     better = better.replace(squeeze_joints=squeeze)
-    return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
+    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(problem.hand, better, config), state)
+    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
+
+
+def effort_share(hand: Hand, grasps: GraspBatch, config: SettleConfig) -> Float[Tensor, " n"]:
+    """Largest share of its effort with which a joint squeezes."""
+    torque = config.weight.stiffness * (grasps.squeeze_joints - grasps.joints) / hand.tree.joint_unit**2
+    return (torque * hand.movable).abs().div(find_efforts(hand).limit).amax(1)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:
