@@ -55,7 +55,7 @@ HEAVY = (0.3, 8.0)
 """Bounds of the factor of its density, likewise."""
 UNSETTLED = 6
 """Grasps of each pair that are tried as refined, without settling."""
-WEIGHT = (0.5, 0.5)
+WEIGHT = (0.75, 0.25)
 """Weight of each kind of trial in the rank of a grasp."""
 RETURNED = 6
 """Grasps of each pair that count as returned: the best of four times as many, as by default."""
@@ -267,7 +267,8 @@ def judged(rows: Rows, seed: int) -> dict[str, Any]:
     for name, column in zip(TRIALS, rows.outcomes.unbind(1), strict=True):
         tried = column.isfinite() & rows.settled
         found[name] = {
-            "area": roc_area(odds[tried], column[tried] > 0.5), "area_before": roc_area(rows.features[tried, 0], column[tried] > 0.5),
+            "area": roc_area(odds[tried], column[tried] > 0.5),
+            "area_before": roc_area(rows.features[tried, 0], column[tried] > 0.5),
             "returned": float(column[tried & chosen].mean()), "of": int((tried & chosen).sum())}
     found["bins"] = reliability(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5)
     found["least"] = [price_of_least(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5, least) for least in LEVELS]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +16,26 @@ from dro_grasp.errors import NoGraspError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.variants import vary_hand
-from dro_grasp.objects.loading import load_mesh
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict import finish
+from dro_grasp.predict.config import PredictorConfig
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import AWAY, GIVES_WAY
-from dro_grasp.predict.shortage import Tally, fingertip_forces, fingertip_range, find_misfits, principal_widths
+from dro_grasp.predict.shortage import Tally, find_misfits, fingertip_forces, fingertip_range, principal_axes
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
 
+LEAST = 0.1  # The default, which tests of other things do without
 JAWS = """<robot name="jaws">
 <link name="base"><collision><origin xyz="0 0 -0.02"/><geometry><box size="0.04 0.2 0.04"/></geometry></collision></link>
 {fingers}
 </robot>"""
-FINGER = """<link name="{name}"><collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
+FINGER = """<link name="{name}">
+<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision></link>
 <joint name="{name}_slides" type="prismatic"><parent link="base"/><child link="{name}"/><origin xyz="0 {y} 0"/>
 <axis xyz="0 {axis} 0"/><limit lower="0" upper="0.03" effort="{effort}" velocity="1"/></joint>"""
 """A jaw of 1 cm thickness that slides 3 cm outwards; between the two there are 2 cm when they are closed."""
@@ -46,7 +52,7 @@ def jaws(tmp_path_factory: pytest.TempPathFactory) -> Hand:
 def box(folder: Path, *sides: float) -> ObjectModel:
     path = folder / f"box_{'_'.join(map(str, sides))}.ply"
     trimesh.creation.box(sides).export(path)
-    return load_mesh(path)
+    return load_object(str(path))
 
 
 def test_jaws_open_and_close_as_far_as_their_joints_slide(jaws: Hand) -> None:
@@ -87,7 +93,7 @@ def test_widths_along_principal_axes_are_those_of_a_turned_box(tmp_path: Path) -
     mesh = trimesh.creation.box((0.02, 0.05, 0.11))
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
     points = mesh.sample(20_000, seed=0)
-    np.testing.assert_allclose(sorted(principal_widths(points)), [0.02, 0.05, 0.11], atol=3e-3)
+    np.testing.assert_allclose(np.ptp(points @ principal_axes(points).T, axis=0), [0.11, 0.05, 0.02], atol=3e-3)
 
 
 @pytest.mark.parametrize(("sides", "density", "said"), [
@@ -129,20 +135,22 @@ def test_words_count_what_became_of_candidates(jaws: Hand, tmp_path: Path) -> No
     assert "probability" not in plain
     assert "--least-confidence" not in plain
     assert "use the source 'auto'" in plain
-    heavy = Tally(0, 20, {}, doubted, 0.1).in_words(replace(problem, obj=replace(problem.obj, density=20_000.0)), 4, alone=False)
+    loaded = replace(problem, obj=replace(problem.obj, density=20_000.0))
+    heavy = Tally(0, 20, {}, doubted, 0.1).in_words(loaded, 4, alone=False)
     assert "Try another seed" not in heavy
     assert "Take a stronger hand" in heavy
 
 
 @pytest.fixture(scope="module")
 def predictor(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
-    return GraspPredictor(str(untrained_weights(tmp_path_factory.mktemp("weights"))))
+    path = untrained_weights(tmp_path_factory.mktemp("weights"))
+    return GraspPredictor(str(path), config=PredictorConfig(finish=FinishConfig(least_confidence=LEAST)))
 
 
 def pairs(folder: Path) -> dict[str, tuple[Hand, ObjectModel, str]]:
     """What no hand can carry, and what is said of it."""
     huge = folder / "huge.urdf"
-    huge.write_text(vary_hand("barrett", factor=4.0))
+    huge.write_text(vary_hand("barrett", factor=1.9))
     small = loaded_hand("gripper3")
     return {
         "a nut and a huge hand": (load_hand(huge), box(folder, 0.004, 0.006, 0.006), "probability below"),
@@ -159,4 +167,12 @@ def test_no_hopeless_grasp_is_returned(predictor: GraspPredictor, tmp_path: Path
     assert said in str(caught.value)
     every = predictor.predict(hand, obj, num=2, seed=1, least_confidence=0.0)
     assert (len(every), every.asked) == (2, 2)
-    assert float(every.confidence.max()) < 0.1
+    assert float(every.confidence.max()) < LEAST
+
+
+def test_commands_tell_the_default() -> None:
+    stated = float(re.search(r"^LEAST_CONFIDENCE = ([\d.]+)", Path(finish.__file__).read_text(), re.MULTILINE)[1])
+    assert stated == LEAST
+    for file in ("generate", "robots", "benchmark"):
+        text = (Path(finish.__file__).parents[1] / "cli" / f"{file}.py").read_text()
+        assert f'optional("P", "{LEAST:g}' in text

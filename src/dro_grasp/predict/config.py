@@ -83,7 +83,7 @@ class RescueConfig(Checked):
     per_grasp_in_surroundings: int = 4
     """Candidates in a round where there are surroundings."""
     least_gain: float = 0.2
-    """No further round follows one that raises the mean score of the best by less [log-odds]."""
+    """No further round follows one that brings no trusted grasp, and raises the mean score of the best by less [log-odds]."""
 
     def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""

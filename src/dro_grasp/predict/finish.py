@@ -26,6 +26,8 @@ from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
 
+LEAST_CONFIDENCE = 0.1
+"""Grasps that hold with less probability are not returned. Ours: see the notebook of `carry` for what other values cost."""
 HOPELESS = -4.0  # Scores below this are alike in `best_mean` [log-odds] (ours)
 
 
@@ -44,7 +46,7 @@ class FinishConfig(Checked):
     ease: EasingConfig | None = field(default_factory=EasingConfig)
     """Room that fingers leave on a bare cloud."""
 
-    least_confidence: float = 0.1
+    least_confidence: float = field(default_factory=lambda: LEAST_CONFIDENCE)
     """Grasps that hold with less probability are not returned."""
 
     def __post_init__(self) -> None:

@@ -252,8 +252,13 @@ class _Asking:
                 return
             before = self.done
             done = self.ask(source, each * lacking, seed)
-            if before is not None and done.best_mean - before.best_mean < self.config.rescue.least_gain:
+            if before is not None and self._is_hopeless(before, done, least_score):
                 return
+
+    def _is_hopeless(self, before: Finished, done: Finished, least_score: float) -> bool:
+        """Whether a round brought neither a grasp that is trusted nor a better one."""
+        gained = done.best_mean - before.best_mean >= self.config.rescue.least_gain
+        return not gained and done.lacking(least_score) >= before.lacking(least_score)
 
 
 def _drawn(first: int, count: int) -> list[int]:

@@ -31,6 +31,15 @@ from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import hand_shift, settle
 
+AWAY = "push it away as they close"  # The object is lost at the first closing
+DEEP = "reach into it"  # The hand is too deep in the object, or in itself
+MOVES = "move it as they close"  # The second closing moves the object too far
+TURNS = "turn it as they close"  # It turns it too far
+FORBIDDEN = "end where the constraints forbid"  # What closing left violates a constraint
+GIVES_WAY = "give way under its weight"  # The weight then moves or turns the object farther than the protocol allows
+DOUBTS = (AWAY, DEEP, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
+"""What closing shows against a grasp, in the order in which the first is told."""
+
 
 @renamed(room_worth="clearance_worth")
 @dataclass(frozen=True)
@@ -107,13 +116,6 @@ def settle_best(
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     return SettledBest(best, closed.replace(score=found), doubts(known, wrong, config))
-
-
-AWAY, DEEP = "push it away as they close", "reach into it"
-MOVES, TURNS = "move it as they close", "turn it as they close"
-FORBIDDEN, GIVES_WAY = "end where the constraints forbid", "give way under its weight"
-DOUBTS = (AWAY, DEEP, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
-"""What closing shows against a grasp, in the order in which the first is told."""
 
 
 def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> tuple[str, ...]:

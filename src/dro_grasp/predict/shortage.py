@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Bool, Float
 
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import even_directions
@@ -24,6 +23,7 @@ POSTURES = 17  # Postures from open to closed in which fingertips are compared (
 LINES = 400  # Directions along which an object is measured (ours)
 ACROSS = 0.2  # Largest cosine between a direction and those that count as across it (ours)
 GRAVITY = 9.81  # [m/s^2]
+LEAST_LEVER = 1e-3  # Joints with a shorter lever do not bend the finger [m] (ours)
 HALF = 0.5  # Openness in which the force of fingertips is looked at (ours)
 
 
@@ -112,9 +112,10 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
 def find_misfits(problem: GraspProblem) -> Iterator[Misfit]:
     """What makes the pair hopeless by its measures: too wide, too thin, or too heavy; nothing where it fits."""
     hand, opening, gap = problem.hand, *fingertip_range(problem.hand)
-    lines = even_directions(LINES)
-    widths = np.ptp(problem.obj.cloud @ lines.numpy().T, axis=0)
-    narrow, middle = float(widths.min()), sorted(principal_widths(problem.obj.cloud))[1]
+    cloud = problem.obj.cloud
+    lines = np.concatenate([even_directions(LINES).numpy(), np.eye(3, dtype=np.float32), principal_axes(cloud)])
+    widths = np.ptp(cloud @ lines.T, axis=0)
+    narrow, middle = float(widths.min()), sorted(np.ptp(cloud @ principal_axes(cloud).T, axis=0).tolist())[1]
     across = widths if problem.constraints.direction is None else widths[_across(lines, problem.constraints.direction)]
     if narrow > opening:
         yield Misfit(f"The object is {_cm(narrow)} wide where it is narrowest, and '{hand.name}' opens {_cm(opening)} at its "
@@ -136,16 +137,14 @@ def _cm(length: float) -> str:
     return f"{1e2 * length:.1f} cm"
 
 
-def _across(lines: Float[Tensor, "n 3"], direction: tuple[float, float, float]) -> np.ndarray:
+def _across(lines: Float[np.ndarray, "n 3"], direction: tuple[float, float, float]) -> Bool[np.ndarray, " n"]:
     """Which lines a hand that comes along a direction closes along."""
-    towards = torch.nn.functional.normalize(torch.tensor(direction, dtype=lines.dtype), dim=0)
-    return ((lines @ towards).abs() < ACROSS).numpy()
+    return np.abs(lines @ np.array(direction) / np.linalg.norm(direction)) < ACROSS
 
 
-def principal_widths(points: Float[np.ndarray, "k 3"]) -> list[float]:
-    """Extents of points along their principal axes [m]."""
-    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
-    return np.ptp(points @ axes.T, axis=0).tolist()
+def principal_axes(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3 3"]:
+    """Axes along which points spread most and least, in rows."""
+    return np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
 
 
 def fingertip_range(hand: Hand) -> tuple[float, float]:
@@ -172,6 +171,6 @@ def fingertip_forces(hand: Hand) -> float:
     tips, poses = torch.tensor(hand.tips), tree.forward(q)
     points = se3.apply(poses[tips], hand.tip_offsets)
     lever = tree.point_jacobian(poses, points, tips).norm(dim=-2)
-    bends = hand.movable & ~hand.abduction & (lever > 1e-3)
-    force = torch.where(bends, find_efforts(hand).limit / lever.clamp_min(1e-3), torch.inf).amin(1)
+    bends = hand.movable & ~hand.abduction & (lever > LEAST_LEVER)
+    force = torch.where(bends, find_efforts(hand).limit / lever.clamp_min(LEAST_LEVER), torch.inf).amin(1)
     return float(force[force.isfinite()].sum())

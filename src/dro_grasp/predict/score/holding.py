@@ -21,6 +21,9 @@ SHIPPED_HOLDING = SHIPPED_FOLDER / "ranking" / "holding.safetensors"  # The mode
 LEAST_MOTION = 1e-4  # Motions below this look alike [m, rad, m/s, rad/s] (ours)
 MOST_MOTION = 0.1  # Motions of an object above this look alike: it is lost [m] (ours)
 LEAST_TURN = 1e-3  # Turns under the weight below this look alike [rad] (ours)
+LEAST_MASS = 1e-3  # Masses below this look alike [kg] (ours)
+DEEP = 0.01  # Depths above this look alike [m] (ours)
+FEATURES = 20  # Numbers of each grasp that the model sees; see `holding_features`
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Evidence(Rows):
         self, rows: Int[Tensor, " k"], depth: Float[Tensor, " k"], effort: Float[Tensor, " k"], state: GraspState
     ) -> Evidence:
         """The same with what the second closing showed of some rows."""
-        def put(old: Tensor, new: Tensor) -> Tensor:
+        def put(old: Float[Tensor, "n *rest"], new: Float[Tensor, "k *rest"]) -> Float[Tensor, "n *rest"]:
             found = old.clone()
             found[rows] = new.to(old)
             return found
@@ -74,13 +77,10 @@ def holding_features(score: Float[Tensor, " n"], known: Evidence) -> Float[Tenso
     amounts = torch.stack([state.contacts, state.links, state.pressure, known.effort], 1).log1p()
     moved = known.moved.clamp(LEAST_MOTION, MOST_MOTION).log()
     flags = torch.stack([known.stable, known.moved.isfinite(), state.shift.isfinite()], 1).to(score)
-    single = torch.stack([score, moved, known.depth.clamp(0, 0.01) / 0.01, known.mass.clamp_min(1e-3).log(),
+    single = torch.stack([score, moved, known.depth.clamp(0, DEEP) / DEEP, known.mass.clamp_min(LEAST_MASS).log(),
                           state.slip.clamp_max(2)], 1)
     return torch.cat([single, motion, amounts, state.unanswered, gave, flags], 1)
 
-
-
-FEATURES = 20  # Numbers of each grasp that the model sees; see `holding_features`
 
 
 class HoldingScore(nn.Module):
