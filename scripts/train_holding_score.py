@@ -1,18 +1,22 @@
-"""Train the model that corrects the score of settled grasps by what simulated closing shows, on outcomes of trials.
+"""Train the score of settled grasps on outcomes of trials, and calibrate it.
 
-    python scripts/train_holding_score.py --folder FOLDER [--num N] [--objects N] [--hands HAND ...] [--collect-only]
+    python scripts/train_holding_score.py --folder FOLDER [--num N] [--rounds N] [--made N] [--minutes M] [--collect-only]
 
-Candidates of the network and of the optimiser are settled as `generate` does, on training objects. The folder keeps the
-grasps of each hand, so a stopped script resumes. Needs the development assets.
+Candidates of the network and of the optimiser are settled as `generate` does, on training objects, on hard ones for training,
+and on stretched and heavy ones, by training hands, by the same ones smaller and larger, and by made-up hands. The folder keeps
+the grasps of each pair of hand and object, so a stopped script resumes. Needs the development assets.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import random
+import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,122 +24,281 @@ import torch
 from torch.nn import functional
 from train_ranking import HANDS
 
-from dro_grasp.compare.metrics import roc_area
+from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
 from dro_grasp.hands.library import load_hand
+from dro_grasp.hands.variants import vary_hand
 from dro_grasp.network.checkpoints import load_weights, save_weights
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.score import SHIPPED_HOLDING, HoldingScore, holding_features
+from dro_grasp.predict.score.holding import SHIPPED_HOLDING, Evidence, HoldingScore, holding_features
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
-from dro_grasp.predict.stages import refine, scored
+from dro_grasp.predict.stages import complete, refine, scored
 from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
+from dro_grasp.training.made_hands.making import make_hand
 
-TRIALS = ("strict", "dexgraspbench", "robust")
-"""Protocols whose outcome the model predicts; the score is the mean of their log-odds."""
+TRIALS = ("carry", "robust")
+"""Protocols whose outcome the model predicts."""
+COSTLY = 0.2
+"""Share of the pairs of hand and object whose grasps get the second kind of trial, too, which takes eight times as long."""
+FIRST_MADE = 20_000
+"""Seed of the first made-up hand; the ranking network has seen others."""
+FACTORS = (0.5, 0.75, 1.4, 2.0)
+"""Sizes of varied training hands."""
+STRETCH = (0.6, 1.8)
+"""Bounds of the factor of an object's size, drawn for a third of the pairs."""
+HEAVY = (0.3, 8.0)
+"""Bounds of the factor of its density, likewise."""
+UNSETTLED = 6
+"""Grasps of each pair that are tried as refined, without settling."""
+WEIGHT = (0.75, 0.25)
+"""Weight of each kind of trial in the rank of a grasp."""
+RETURNED = 6
+"""Grasps of each pair that count as returned: the best of four times as many, as by default."""
 FOLDS = 5
-"""Groups of hands, each left out of one fit, whose grasps judge it."""
+"""Groups of hands, each left out of one fit."""
 WIDTH, STEPS, RATE, DECAY = 8, 600, 1e-2, 0.3
 """Width of the hidden layer; steps, peak learning rate and weight decay of the fit."""
 NOISE = 0.05
 """Standard deviation of the noise on inputs, as a share of theirs."""
+PRIOR = 2.0
+"""How strongly the calibration is drawn to none."""
+LEVELS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
+"""Least confidences whose price is told."""
+SEED = 0
+"""Of fits and folds."""
 
 
-def collect(network: DistanceNetwork, name: str, objects: int, num: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Settled grasps of one hand on some training objects: their score, how they hold, and outcomes of trials."""
-    hand, rng = load_hand(name), random.Random(f"{name} {seed}")
-    for label in rng.sample(resolve_objects(["assets:train"]), objects):
-        obj = load_object(label)
-        problem = GraspProblem(hand, obj)
-        generator = torch.Generator().manual_seed(rng.randrange(10**6))
-        found = {"network": propose(problem, network, num, generator).grasps,
-                 "optimiser": OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps}
-        for maker, grasps in found.items():
-            grasps = scored(problem, refine(problem, grasps))
-            better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]
-            found = settle_grasps(problem, better)
-            grasps = found.grasps[found.stable]
-            if not len(grasps):
+def hands(folder: Path, made: int) -> list[str]:
+    """Training hands, varied ones and made-up ones, in the order in which they are used."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = list(HANDS)
+    for name, factor in zip(("allegro", "barrett", "gripper3", "leaphand", "shadowhand"), (*FACTORS, 0.6), strict=True):
+        path = folder / f"{name}_{factor:g}.urdf"
+        if not path.exists():
+            path.write_text(vary_hand(name, factor=factor))
+        found.append(str(path))
+    for seed in range(FIRST_MADE, FIRST_MADE + made):
+        path = folder / f"hand_{seed:05d}.urdf"
+        if not path.exists():
+            path.write_text(make_hand(seed).urdf)
+        found.append(str(path))
+    return found
+
+
+def some_object(rng: random.Random) -> tuple[str, ObjectModel]:
+    """A training object, or a hard one for training; some are stretched, some heavy or light."""
+    label = rng.choice(resolve_objects([rng.choice(["assets:train", "builtin:hard_train"])]))
+    scale = rng.uniform(*STRETCH) if rng.random() < 1 / 3 else 1.0
+    obj = load_object(label, scale=scale)
+    low, high = HEAVY
+    heavier = low * (high / low) ** rng.random() if rng.random() < 1 / 3 else 1.0
+    return f"{label} x{scale:.2f} m{heavier:.2f}", replace(obj, density=obj.density * heavier)
+
+
+def collect(network: DistanceNetwork, name: str, num: int, rng: random.Random) -> Iterator[dict[str, Any]]:
+    """Grasps of a hand on an object: their score, what closing showed, and outcomes of trials; NaN where not tried."""
+    hand, (label, obj) = load_hand(name), some_object(rng)
+    problem, costly = GraspProblem(hand, obj), rng.random() < COSTLY
+    generator = torch.Generator().manual_seed(rng.randrange(10**6))
+    about = {"hand": hand.name, "object": label}
+    found = {"network": propose(problem, network, num, generator).grasps,
+             "optimiser": OptimiserSource().propose(problem, num // 2, rng.randrange(10**6)).grasps}
+    for maker, grasps in found.items():
+        if not len(grasps):
+            continue
+        grasps = scored(problem, refine(problem, grasps))
+        few = grasps[torch.randperm(len(grasps), generator=generator)[:UNSETTLED // len(found)]]
+        yield {**about, "maker": f"{maker}, unsettled", "score": few.score,
+               "outcomes": outcomes(problem, few, False), **columns(Evidence.none(len(few), obj.mass))}
+        better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]
+        settled = settle_grasps(problem, better)
+        yield {**about, "maker": maker, "score": scored(problem, settled.grasps).score,
+               "outcomes": outcomes(problem, settled.grasps, costly), **columns(settled.known)}
+
+
+def outcomes(problem: GraspProblem, grasps: Any, costly: bool) -> torch.Tensor:
+    """Success in each kind of trial; NaN in those that are too costly."""
+    grasps = complete(problem, grasps)
+    missing = torch.full((len(grasps),), torch.nan)
+    return torch.stack([simulate(problem.hand, problem.solid, grasps, rules).success.float() if costly or not k else missing
+                        for k, rules in enumerate(TRIALS)], 1)
+
+
+def columns(known: Evidence) -> dict[str, Any]:
+    """What is known of grasps, as a file keeps it."""
+    own = {f.name: getattr(known, f.name) for f in fields(known) if f.name != "state"}
+    return own | {"state": {f.name: getattr(known.state, f.name) for f in fields(known.state)}}
+
+
+def gather(folder: Path, made: int, rounds: int, num: int, minutes: float) -> None:
+    """Collect grasps of every hand once a round, until there are enough or the time is over."""
+    end, network = time.monotonic() + 60 * minutes, load_weights(None)
+    for turn in range(rounds):
+        for name in hands(folder / "hands", made):
+            stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
+            path = folder / f"{turn}-{stem}.pt"
+            if path.exists():
                 continue
-            outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
-            yield {"hand": hand.name, "object": label, "maker": maker, "score": scored(problem, grasps).score,
-                   "outcomes": outcomes.float(), **{f.name: getattr(found.state, f.name) for f in fields(GraspState)}}
+            if time.monotonic() > end:
+                return
+            begin = time.monotonic()
+            parts = list(collect(network, name, num, random.Random(f"{stem} {turn}")))
+            torch.save(parts, path)
+            held = torch.cat([part["outcomes"] for part in parts]).nanmean(0)
+            print(path.stem, parts[0]["object"], sum(len(p["score"]) for p in parts), [round(x, 2) for x in held.tolist()],
+                  f"{time.monotonic() - begin:.0f} s", flush=True)
 
 
-def fit(parts: list[dict[str, Any]], seed: int) -> HoldingScore:
+@dataclass(frozen=True)
+class Rows:
+    """Grasps of many pairs, in rows."""
+
+    features: torch.Tensor
+    outcomes: torch.Tensor  # NaN where not tried
+    hand: list[str]
+    pair: torch.Tensor  # number of the pair of hand and object
+    settled: torch.Tensor  # whether it was settled, as what is returned is; the others are tried as refined
+
+    @staticmethod
+    def read(folder: Path) -> Rows:
+        """All grasps of a folder."""
+        features, outcomes, hand, pair, settled = [], [], [], [], []
+        for number, path in enumerate(sorted(folder.glob("*.pt"))):
+            for part in torch.load(path, weights_only=True):
+                state = GraspState(**part["state"])
+                known = Evidence(**{f.name: part[f.name] for f in fields(Evidence) if f.name != "state"}, state=state)
+                n = len(part["score"])
+                features.append(holding_features(part["score"], known))
+                outcomes.append(part["outcomes"][:, [0, -1]])
+                hand += [part["hand"]] * n
+                pair += [number] * n
+                settled += [not part["maker"].endswith("unsettled")] * n
+        return Rows(torch.cat(features), torch.cat(outcomes), hand, torch.tensor(pair), torch.tensor(settled))
+
+    def of(self, hands: set[str], inside: bool = True) -> torch.Tensor:
+        """Which rows are of these hands, or of others."""
+        return torch.tensor([(hand in hands) == inside for hand in self.hand])
+
+    def returned(self, rank: torch.Tensor) -> torch.Tensor:
+        """Which rows a request would return: the best of each pair by rank."""
+        kept = torch.zeros(len(self.pair), dtype=torch.bool)
+        for pair in self.pair.unique():
+            rows = (self.settled & (self.pair == pair) & rank.isfinite()).nonzero()[:, 0]
+            kept[rows[rank[rows].topk(min(RETURNED, len(rows))).indices]] = True
+        return kept
+
+
+def fit(features: torch.Tensor, outcomes: torch.Tensor, seed: int) -> HoldingScore:
     """A model of the outcomes of these grasps."""
     torch.manual_seed(seed)  # of the initial weights
     generator = torch.Generator().manual_seed(seed)
-    features, outcomes = (torch.cat([part[key] for part in parts]) for key in ("features", "outcomes"))
-    model = HoldingScore(len(TRIALS), WIDTH)
-    model.mean, model.deviation = features.mean(0), features.std(0) + 1e-3
+    model, tried = HoldingScore(len(TRIALS), WIDTH), outcomes.isfinite()
+    model.mean = features.nanmean(0)
+    model.deviation = (features - model.mean).square().nanmean(0).sqrt() + 1e-3
     optimiser = torch.optim.AdamW(model.layers.parameters(), RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=STEPS)
+    share = 1 / tried.sum(0).clamp_min(1)  # each kind of trial counts alike, however many were tried
     for _ in range(STEPS):
         noise = NOISE * model.deviation * torch.randn(features.shape, generator=generator)
-        loss = functional.binary_cross_entropy_with_logits(model(features + noise), outcomes)
+        each = functional.binary_cross_entropy_with_logits(model(features + noise), outcomes.nan_to_num(0.0), reduction="none")
+        loss = (each * tried * share).sum() / len(TRIALS)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
+    model.weight = torch.tensor(WEIGHT)
     return model.eval().requires_grad_(False)
 
 
-def judged(parts: list[dict[str, Any]], seed: int) -> dict[str, Any]:
-    """What fits that left some hands out say of the grasps of these hands: loss, and ROC areas with and without the model."""
-    hands = sorted({part["hand"] for part in parts})
-    random.Random(seed).shuffle(hands)
-    found, before, outcomes = [], [], []
-    for fold in range(FOLDS):
-        out = set(hands[fold::FOLDS])
-        model = fit([part for part in parts if part["hand"] not in out], seed)
-        for part in parts:
-            if part["hand"] in out:
-                found.append(model(part["features"]))
-                before.append(part["score"])
-                outcomes.append(part["outcomes"])
-    odds, scores, held = torch.cat(found), torch.cat(before), torch.cat(outcomes)
-    return {
-        "loss": float(functional.binary_cross_entropy_with_logits(odds, held)),
-        "areas": {rules: roc_area(odds.mean(1), held[:, k] > 0.5) for k, rules in enumerate(TRIALS)},
-        "areas_before": {rules: roc_area(scores, held[:, k] > 0.5) for k, rules in enumerate(TRIALS)},
-    }
+def calibrate(rank: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
+    """Offset, and slopes below and above zero, of the log-odds by rank: the likeliest, slightly drawn to what it was."""
+    free = torch.tensor([0.0, math.log(math.e - 1), math.log(math.e - 1)], requires_grad=True)  # softplus of it is 1
+    start, optimiser = free.detach().clone(), torch.optim.LBFGS([free], max_iter=200, line_search_fn="strong_wolfe")
+
+    def loss() -> torch.Tensor:
+        optimiser.zero_grad()
+        below, above = functional.softplus(free[1:])
+        odds = free[0] + below * rank.clamp_max(0) + above * rank.clamp_min(0)
+        value = functional.binary_cross_entropy_with_logits(odds, held, reduction="sum") + PRIOR * (free - start).square().sum()
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    return torch.cat([free[:1], functional.softplus(free[1:])]).detach()
+
+
+def folds(hands: set[str], seed: int) -> list[set[str]]:
+    """Groups of hands; each is left out of one fit."""
+    names = sorted(hands)
+    random.Random(seed).shuffle(names)
+    return [set(names[k::FOLDS]) for k in range(FOLDS) if names[k::FOLDS]]
+
+
+def left_out_ranks(rows: Rows, hands: set[str], seed: int) -> torch.Tensor:
+    """Ranks of the grasps of these hands by fits on the others of them; NaN for grasps of other hands."""
+    found = torch.full((len(rows.hand),), torch.nan)
+    for out in folds(hands, seed):
+        there, inside = rows.of(out), rows.of(hands - out)
+        found[there] = fit(rows.features[inside], rows.outcomes[inside], seed).rank(rows.features[there])
+    return found
+
+
+def calibrated_fit(rows: Rows, hands: set[str], seed: int) -> HoldingScore:
+    """A model of the grasps of these hands, calibrated on what would be returned for hands that a fit left out."""
+    ranks, inside = left_out_ranks(rows, hands, seed), rows.of(hands)
+    chosen = rows.returned(ranks)
+    model = fit(rows.features[inside], rows.outcomes[inside], seed)
+    model.calibration = calibrate(ranks[chosen], rows.outcomes[chosen, 0])
+    return model
+
+
+def judged(rows: Rows, seed: int) -> dict[str, Any]:
+    """What nested fits say of hands that they have not seen: how the order is, and how what is told agrees with trials."""
+    hands, odds = set(rows.hand), torch.full((len(rows.hand),), torch.nan)
+    for out in folds(hands, seed + 1):
+        there, model = rows.of(out), calibrated_fit(rows, hands - out, seed)
+        odds[there] = model.calibrated(model.rank(rows.features[there]))
+    chosen, found = rows.returned(odds), {}
+    for name, column in zip(TRIALS, rows.outcomes.unbind(1), strict=True):
+        tried = column.isfinite() & rows.settled
+        found[name] = {
+            "area": roc_area(odds[tried], column[tried] > 0.5),
+            "area_before": roc_area(rows.features[tried, 0], column[tried] > 0.5),
+            "returned": float(column[tried & chosen].mean()), "of": int((tried & chosen).sum())}
+    found["bins"] = reliability(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5)
+    found["least"] = [price_of_least(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5, least) for least in LEVELS]
+    return found
 
 
 def main() -> None:
     """Collect, fit, save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="folder for the grasps")
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect grasps of")
-    parser.add_argument("--objects", type=int, default=3, help="training objects of each hand")
-    parser.add_argument("--num", type=int, default=24, help="candidates of each, from each origin")
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything")
+    parser.add_argument("--made", type=int, default=24, help="made-up hands")
+    parser.add_argument("--rounds", type=int, default=8, help="objects of each hand")
+    parser.add_argument("--num", type=int, default=32, help="candidates of the network for each pair, and half as many others")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="when to stop collecting")
+    parser.add_argument("--output", type=Path, default=SHIPPED_HOLDING, help="where the model is written")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    options.folder.mkdir(parents=True, exist_ok=True)
-    network = load_weights(None)
-    for name in options.hands:
-        stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
-        path = options.folder / f"{stem}-{options.seed}.pt"
-        if not path.exists():
-            torch.save(list(collect(network, name, options.objects, options.num, options.seed)), path)
-            print(name, flush=True)
+    gather(options.folder, options.made, options.rounds, options.num, options.minutes)
     if options.collect_only:
         return
-    parts = [part for path in sorted(options.folder.glob("*.pt")) for part in torch.load(path, weights_only=True)]
-    for part in parts:
-        part["features"] = holding_features(part["score"], GraspState(**{f.name: part[f.name] for f in fields(GraspState)}))
-    found, grasps = judged(parts, options.seed), sum(len(part["score"]) for part in parts)
-    print(f"{grasps} grasps; hands left out of a fit: {found}")
+    rows = Rows.read(options.folder)
+    found = judged(rows, SEED)
+    print(json.dumps(found, indent=1))
+    model = calibrated_fit(rows, set(rows.hand), SEED)
     about = {
-        "stage": "ranking of settled grasps", "script": Path(__file__).name, "trials": TRIALS, "seed": options.seed, **found,
-        "data": {"hands": dict(Counter(part["hand"] for part in parts for _ in part["score"])), "grasps": grasps},
+        "stage": "ranking of settled grasps", "script": Path(__file__).name, "trials": TRIALS, "seed": SEED, **found,
+        "data": {"hands": dict(Counter(rows.hand)), "grasps": len(rows.hand), "pairs": int(rows.pair.max()) + 1},
     }
-    save_weights(fit(parts, options.seed), SHIPPED_HOLDING, about)
+    save_weights(model, options.output, about)
 
 
 if __name__ == "__main__":

@@ -156,7 +156,6 @@ def test_the_page_of_the_method_has_the_numbers_of_the_code() -> None:
         f"exp(-d+ / {NEAR * mm:g} mm)",
         f"m < {settle.still * mm:g} mm",
         f"{settle.still * mm:g} mm <= m < {settle.lost * 1e2:g} cm",
-        f"its score is at most {settle.unstable_score:g}",
         f"by {settle.farthest * 1e2:g} cm or {math.degrees(settle.largest_turn):g} degrees",
         f"is {settle.deepest * mm:g} mm deep",
         f"each cube of {BALL_SPACING * mm:g} mm",

@@ -32,10 +32,10 @@ from dro_grasp.predict.admission import (
     clear,
     count_violations,
     feasible,
-    shortage_in_words,
 )
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.shortage import Tally
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import refine
 from tests.helpers.loaded_hands import loaded_hand
@@ -257,6 +257,6 @@ def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
      (SEEN_ON_A_TABLE, None, TURNED, "Try another seed")])
 def test_a_table_is_named_where_it_was_given_or_found(obj: ObjectModel, table: float | None, reason: str, said: str) -> None:
     problem = GraspProblem(toy_hand(), obj, constraints=Constraints(table=table))
-    words = shortage_in_words(problem, 2, 1, 2, {reason: 1}, alone=False)
+    words = Tally(1, 2, {reason: 1}).in_words(problem, 2, alone=False)
     assert said in words
     assert ("found in the cloud" in words) == ("found in the cloud" in said)

@@ -353,7 +353,7 @@ def test_prediction_runs_wholly_on_the_device_it_is_told(
 def rescuing(predictor: GraspPredictor, scores: tuple[float, ...], per_grasp: int) -> GraspPredictor:
     """The predictor with other rounds of a quick optimiser."""
     other = copy.copy(predictor)
-    other.config = PredictorConfig(optimiser=QUICK, rescue=RescueConfig(scores, per_grasp))
+    other.config = PredictorConfig(optimiser=QUICK, rescue=RescueConfig(scores, per_grasp, least_gain=-math.inf))
     return other
 
 
@@ -371,6 +371,19 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
     assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
     assert bool((again.grasps.score >= helped.grasps.score).all())
     assert rescuing(predictor, (-math.inf, math.inf), 3).run(problem, auto).candidates == network.candidates
+
+
+def test_no_round_follows_one_that_brings_nothing(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    """Demands that nothing meets stop after a round that gains too little; the optimiser alone always has a second one."""
+    patient, source = rescuing(predictor, (math.inf,) * 4, 2), Noting()
+    hasty = copy.copy(patient)
+    hasty.config = dataclasses.replace(patient.config, rescue=dataclasses.replace(patient.config.rescue, least_gain=math.inf))
+    problem, request = GraspProblem(HAND, ball), GraspRequest(2, seed=1, source="auto")
+    network = predictor.run(problem, dataclasses.replace(request, source="network")).candidates
+    assert hasty.run(problem, request).candidates == network + 4
+    assert patient.run(problem, request).candidates == network + 4 * 4
+    hasty.run(problem, dataclasses.replace(request, source=source))
+    assert len(source.asked_for) == 2
 
 
 class Noting(OptimiserSource):
@@ -395,7 +408,8 @@ def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(predictor: Gra
 
 def test_in_surroundings_fewer_rivals_are_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
     asked, source = copy.copy(predictor), Noting()
-    rescue = RescueConfig((math.inf,), 3, trusted_in_surroundings=(math.inf, math.inf), per_grasp_in_surroundings=1)
+    rescue = RescueConfig((math.inf,), 3, trusted_in_surroundings=(math.inf, math.inf), per_grasp_in_surroundings=1,
+                          least_gain=-math.inf)
     asked.config = PredictorConfig(finish=FinishConfig.nothing(), rescue=rescue)
     for table in (None, -0.1):
         problem = GraspProblem(HAND, ball, constraints=Constraints(table=table))

@@ -73,6 +73,8 @@ class PlanConfig(Checked):
     """Candidates for each grasp, as in `GraspRequest`: which of them can be reached decides more than the best scores."""
     source: str | Source = AUTO
     """What proposes grasps, as in `GraspRequest`."""
+    least_confidence: float | None = None
+    """Grasps that hold with less probability are not tried, as in `GraspRequest`."""
     best_seconds: float = 1.0
     """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
@@ -275,7 +277,8 @@ def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBa
         task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
     return lambda seed: grasps_in_world(
         predictor, task.robot.hand, task.obj, task.T,
-        GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source), wanted, directions)
+        GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source,
+                     least_confidence=task.config.least_confidence), wanted, directions)
 
 
 def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:

@@ -62,6 +62,8 @@ class Plan:
     without a table has none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
+    least_confidence: Annotated[float | None, optional("P", "0.1")] = None
+    """Grasps that hold with less probability are not tried; 0 tries all."""
     planner_seconds: float = 3.0  # Longest time for one path [s].
     seed: int = 0  # Seed of grasps, inverse kinematics and planner.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -92,7 +94,8 @@ class Plan:
         scene = None if self.scene is None else load_scene(self.scene)
         constraints = self.constraints.constraints(obstacles=scene)
         config = PlanConfig(
-            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
+            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds,
+            least_confidence=self.least_confidence)
         for option, place in (("--at", self.at), ("--near", self.near)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")

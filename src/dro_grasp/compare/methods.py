@@ -34,6 +34,8 @@ class MethodOptions(Checked):
     """A `Bundle` of training grasps, for the mean grasp."""
     candidates: int = GraspRequest.candidates
     """Candidates for each grasp that a method returns."""
+    least_confidence: float | None = None
+    """Grasps that hold with less probability are not returned; None takes the default."""
 
 
 class Method:
@@ -105,6 +107,8 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     config = PredictorConfig()
     if options.temperature is not None:
         config = replace(config, network=replace(config.network, temperature=options.temperature))
+    if options.least_confidence is not None:
+        config = replace(config, finish=replace(config.finish, least_confidence=options.least_confidence))
     predictor = GraspPredictor(weights if own else options.weights, options.device, config)
     if plain in WITH_DATA:
         means = None if options.bundle is None else mean_grasps_of(options.bundle)

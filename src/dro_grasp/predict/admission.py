@@ -161,38 +161,7 @@ def opened_wide(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     return grasps.replace(pregrasp_joints=q)
 
 
-def shortage_in_words(
-    problem: GraspProblem, asked: int, found: int, made: int, dropped: Mapping[str, int], alone: bool
-) -> str:
-    """How many grasps there are, what candidates were dropped for, and what to do.
-
-    Args:
-        problem: With its constraints.
-        asked: Grasps that were asked for.
-        found: Grasps that there are.
-        made: Candidates that were made.
-        dropped: Candidates that the constraints rejected, by reason.
-        alone: Whether one source alone made the candidates.
-    """
-    constraints, low, high = problem.constraints, *problem.height_range
-    advice = {
-        "table": f"lower table (now {constraints.table} m; the object spans z = {low:.3f} to {high:.3f} m)",
-        "max_tilt": f"widen max_tilt (now {constraints.max_tilt} rad)",
-        "direction": "leave out direction, or give another one",
-        "obstacles": "check that obstacles is in the object's frame, and leave out what may be touched",
-        "contact_region": "enlarge the balls of contact_region",
-        "keep_out": "make the balls of keep_out smaller",
-        "pregrasp_clearance": f"ask for less pregrasp_clearance (now {constraints.pregrasp_clearance} m)",
-    }
-    given = [words for name, words in advice.items() if getattr(constraints, name) not in (None, ())]
-    if constraints.table is None and dropped.get(PLANE):
-        given.append("state the table's height if it is lower than the one found in the cloud")
-    given += ["use the source 'auto'"] if alone else []
-    return (f"only {found} of {made} candidates on object '{problem.obj.name}' meet what was asked of them"
-            f"{dropped_in_words(dropped)}; {asked} were asked for. {'; or '.join(['Try another seed', *given])}")
-
-
-def dropped_in_words(dropped: Mapping[str, int]) -> str:
+def dropped_in_words(dropped: Mapping[str, int], before: str = "dropped: ") -> str:
     """How many candidates were dropped, and why, in brackets; nothing for none."""
     reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
-    return f" (dropped: {reasons})" if reasons else ""
+    return f" ({before}{reasons})" if reasons else ""

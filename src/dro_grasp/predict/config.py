@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked
-from dro_grasp.predict.finish import FinishConfig
+from dro_grasp.predict.finish import FinishConfig, check_confidence
 from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.predict.sources.registry import source_or_name
@@ -31,6 +31,9 @@ class GraspRequest(Checked):
     """Spread of z, from 0 to 2; None takes the predictor's."""
     source: str | Source = AUTO
     """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source."""
+    least_confidence: float | None = None
+    """Grasps that hold with less probability are not returned: 0 returns all. None takes the predictor's, and 0 without
+    refinement."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done, before any work.
@@ -50,6 +53,7 @@ class GraspRequest(Checked):
         if not 0 <= self.seed < 2**63:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         check_temperature(self.temperature)
+        check_confidence(self.least_confidence or 0.0)
         if isinstance(self.source, str):
             object.__setattr__(self, "source", source_or_name(self.source))
 
@@ -78,6 +82,8 @@ class RescueConfig(Checked):
     """Trusted scores where there are surroundings, with which a descent takes longer."""
     per_grasp_in_surroundings: int = 4
     """Candidates in a round where there are surroundings."""
+    least_gain: float = 0.2
+    """No further round follows one that brings no trusted grasp, and raises the mean score of the best by less [log-odds]."""
 
     def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""

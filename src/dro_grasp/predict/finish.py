@@ -9,20 +9,26 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from dro_grasp.devices import Stopwatch
+from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import EasingConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violations, feasible
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
+
+LEAST_CONFIDENCE = 0.1
+"""Grasps that hold with less probability are not returned. Ours: see the notebook of `carry` for what other values cost."""
+HOPELESS = -4.0  # Scores below this are alike in `best_mean` [log-odds] (ours)
 
 
 @dataclass(frozen=True)
@@ -40,10 +46,24 @@ class FinishConfig(Checked):
     ease: EasingConfig | None = field(default_factory=EasingConfig)
     """Room that fingers leave on a bare cloud."""
 
+    least_confidence: float = field(default_factory=lambda: LEAST_CONFIDENCE)
+    """Grasps that hold with less probability are not returned."""
+
+    def __post_init__(self) -> None:
+        """Refuse a confidence that is no probability below one: OptionError."""
+        super().__post_init__()
+        check_confidence(self.least_confidence)
+
     @staticmethod
     def nothing() -> FinishConfig:
         """Candidates as they come, scored and admitted alone."""
-        return FinishConfig(refine=None, settle=None, ease=None)
+        return FinishConfig(refine=None, settle=None, ease=None, least_confidence=0.0)
+
+
+def check_confidence(least: float) -> None:
+    """Refuse a least confidence that is no probability below one: OptionError."""
+    if not 0 <= least < 1:
+        raise OptionError(f"least_confidence is {least}; give a probability from 0, which returns everything, to below 1")
 
 
 @dataclass(frozen=True)
@@ -68,11 +88,24 @@ class Finished:
     """Those that constraints rejected, by reason."""
     seconds: dict[str, float]
     """Time by stage [s]."""
+    doubts: tuple[str, ...] = ()
+    """What closing showed against each of the pool, in words; empty for nothing."""
 
     @cached_property
     def rows(self) -> Int[Tensor, " k"]:
-        """Rows of the best in the pool, the best score first."""
-        return (-self.pool.score).argsort(stable=True)[: self.keep]
+        """Rows of the best in the pool, the best score first, without those that are not trusted enough."""
+        best = (-self.pool.score).argsort(stable=True)[: self.keep]
+        return best[self.trusted[best]]
+
+    @cached_property
+    def trusted(self) -> Bool[Tensor, " n"]:
+        """Which of the pool are confident enough to be returned."""
+        return ~(self.pool.confidence < self.config.least_confidence)
+
+    @property
+    def doubted(self) -> Counter[str]:
+        """How many of the pool are not, by what closing showed against them."""
+        return Counter(why for why, trusted in zip(self.doubts, self.trusted.tolist(), strict=True) if not trusted)
 
     @cached_property
     def grasps(self) -> GraspBatch:
@@ -84,6 +117,12 @@ class Finished:
     def proposed(self) -> Candidates:
         """The best as they were proposed."""
         return self.candidates[self.rows]
+
+    @cached_property
+    def best_mean(self) -> float:
+        """Mean score of the wanted grasps; those that are missing count as HOPELESS."""
+        best = self.pool.score.sort(descending=True).values[: self.keep].clamp_min(HOPELESS)
+        return (float(best.sum()) + HOPELESS * (self.keep - len(best))) / self.keep
 
     def lacking(self, least_score: float) -> int:
         """How many of the wanted grasps are missing, or score no better than `least_score`."""
@@ -115,14 +154,18 @@ def finish(
     candidates, made = candidates[allowed], len(candidates) + candidates.turned
     with watch("rank"):
         refined = pool = scored(problem, whole[allowed], config.score)
-    if config.settle is not None and can_settle(problem) and len(refined):
-        with watch("settle"):
-            rows, pool = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
-        candidates = candidates[rows]
+    doubts = ("",) * len(pool)
+    if config.settle is not None and len(refined):
+        if can_settle(problem):
+            with watch("settle"):
+                rows, pool, doubts = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
+            candidates = candidates[rows]
+        else:
+            pool = refined.replace(score=holding_score(refined.score, Evidence.none(len(refined), problem.mass)))
     seconds = watch.seconds
     if rivals is not None:
-        pool = GraspBatch.concatenate([rivals.pool, pool])
+        pool, doubts = GraspBatch.concatenate([rivals.pool, pool]), (*rivals.doubts, *doubts)
         candidates = Candidates.concatenate([rivals.candidates, candidates])
         dropped, made = rivals.dropped + dropped, rivals.made + made
         seconds = {name: rivals.seconds[name] + spent for name, spent in seconds.items()}
-    return Finished(problem, config, keep, pool, candidates, refined, made, dropped, seconds)
+    return Finished(problem, config, keep, pool, candidates, refined, made, dropped, seconds, doubts)

@@ -23,11 +23,11 @@ from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.starts import Direction
-from dro_grasp.predict.admission import shortage_in_words
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, Finished, finish
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.shortage import shortage_in_words
 from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.sources.registry import source_or_name
@@ -103,6 +103,7 @@ class GraspPredictor:
         obstacles: Scene | None = None, contact_region: tuple[Ball, ...] = (), keep_out: tuple[Ball, ...] = (),
         pregrasp_clearance: float | None = None, margin: float | None = None, max_force: float | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
+        least_confidence: float | None = None,
     ) -> GraspBatch:
         """Grasps with pregrasp, squeeze and score, the best score first; fewer, with a warning, if no more can be found.
 
@@ -127,6 +128,8 @@ class GraspPredictor:
             temperature: Spread of z: 0 for the likeliest grasps, 1 for the diversity of the training grasps; None takes the
                 predictor's.
             source: What proposes: `auto`, `network`, `optimiser`, another name that `make_source` knows, or a source.
+            least_confidence: Grasps that hold with less probability are not returned: 0 returns all; None takes the
+                predictor's.
 
         Raises:
             ObjectError: The obstacles contain the object.
@@ -140,7 +143,7 @@ class GraspPredictor:
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:
             warnings.warn(warning, stacklevel=2)
-        made = self.run(problem, GraspRequest(num, seed, candidates, refine, temperature, source))
+        made = self.run(problem, GraspRequest(num, seed, candidates, refine, temperature, source, least_confidence))
         if made.shortage is not None:
             warnings.warn(made.shortage, stacklevel=2)
         return made.grasps
@@ -165,18 +168,18 @@ class GraspPredictor:
                 raise OptionError(f"source '{source.name}' does not know hand '{problem.hand.name}'; choose another source")
         config = self.config.finish
         if not request.refine:
-            config = replace(config, refine=None, settle=None, ease=None)
+            config = replace(config, refine=None, settle=None, ease=None, least_confidence=0.0)
+        if request.least_confidence is not None:
+            config = replace(config, least_confidence=request.least_confidence)
         asked = _Asking(self, problem, request, config, progress)
         if first is not None:
             asked.until_enough(first)
         if rescue is not None:
             asked.until_trusted(rescue)
         done, shortage = asked.done, None
-        if done is None or len(done.pool) < request.num:
-            alone = first is None or rescue is None
-            shortage = shortage_in_words(problem, request.num, 0 if done is None else len(done.pool),
-                                         0 if done is None else done.made, {} if done is None else done.dropped, alone)
-        if done is None or not len(done.pool):
+        if done is None or len(done.rows) < request.num:
+            shortage = shortage_in_words(problem, request.num, done, alone=first is None or rescue is None)
+        if done is None or not len(done.rows):
             raise NoGraspError(str(shortage))
         proposed = done.proposed
         given, before = (grasps.with_asked(request.num) for grasps in (
@@ -250,7 +253,15 @@ class _Asking:
             lacking = self.request.num if self.done is None else self.done.lacking(least_score)
             if not lacking:
                 return
-            self.ask(source, each * lacking, seed)
+            before = self.done
+            done = self.ask(source, each * lacking, seed)
+            if before is not None and self._is_hopeless(before, done, least_score):
+                return
+
+    def _is_hopeless(self, before: Finished, done: Finished, least_score: float) -> bool:
+        """Whether a round brought neither a grasp that is trusted nor a better one."""
+        gained = done.best_mean - before.best_mean >= self.config.rescue.least_gain
+        return not gained and done.lacking(least_score) >= before.lacking(least_score)
 
 
 def _drawn(first: int, count: int) -> list[int]:

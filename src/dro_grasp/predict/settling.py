@@ -1,7 +1,8 @@
 """Settling: the closing of the hand is simulated until it leaves the object where it is.
 
-In contact simulation, fingers and object find the places that geometry alone gets wrong by millimetres. No force is tried on
-the object, so this is no trial; it needs the hand's description. Balls stand for a bare cloud. Ours.
+In contact simulation, fingers and object find the places that geometry alone gets wrong by millimetres, and the weight then
+pulls at the object as in a trial under `carry`, for a fifth of the time. Needs the hand's description. Balls stand for a bare
+cloud. Ours.
 """
 
 from __future__ import annotations
@@ -16,17 +17,30 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CARRYING, PER_JOINT
+from dro_grasp.hands.effort import find_efforts
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, renamed
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.score import ScoreConfig, holding_score
+from dro_grasp.predict.score.holding import Evidence, holding_score
+from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import GraspState, WeightConfig, grasp_state
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press
+from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import hand_shift, settle
+
+AWAY = "push it away as they close"  # The object is lost at the first closing
+DEEP = "reach into it"  # The hand is too deep in the object, or in itself
+MOVES = "move it as they close"  # The second closing moves the object too far
+TURNS = "turn it as they close"  # It turns it too far
+FORBIDDEN = "end where the constraints forbid"  # What closing left violates a constraint
+GIVES_WAY = "give way under its weight"  # The weight then moves or turns the object farther than the protocol allows
+DOUBTS = (AWAY, DEEP, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
+"""What closing shows against a grasp, in the order in which the first is told."""
 
 
 @renamed(room_worth="clearance_worth")
@@ -38,14 +52,12 @@ class SettleConfig(Checked):
     """Share of scored candidates that are settled, the best ones; the others are left out."""
     clearance_worth: float = 80.0
     """What the score of a grasp on an object seen in part loses for clearance that the opened hand lacks [log-odds per m]."""
-    unstable_score: float = -4.0
-    """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding]."""
     still: float = 0.005
     """A grasp that moves the object less than this has settled; others are refined where they stand, and close again [m]."""
     lost: float = 0.05
     """An object that moves farther than this is lost [m]."""
     farthest: float = 0.02
-    """How far it may move the second time [m]."""
+    """How far it may move the last time [m]."""
     largest_turn: float = math.radians(30)
     """How far it may turn then [rad]."""
     deepest: float = 0.005
@@ -53,36 +65,11 @@ class SettleConfig(Checked):
     closing: str = "strict"
     """Physics of the first closing, which says where a grasp ends: fingers as strong as each other."""
     protocol: str = "carry"
-    """Physics of the second closing, and of the pulls after it."""
-    giving_worth: float = 3.0
-    """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
-    payload_worth: float = 1.0
-    """What it loses where the payload is a factor of e short of the object's mass with the margin [log-odds]."""
+    """Physics of the later closings, and of the pulls after them."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
-    """How grasps are refined between the two closings, and how settled ones squeeze."""
-
-
-GIVES = 0.02
-"""How far a load may move what is held [m]. Ours: as under `carry`."""
-TURNS = math.radians(15)
-"""How far a load may turn it [rad], likewise."""
-SHORTEST = 0.05
-"""Least share of the needed payload that counts (ours): what carries less is as hopeless."""
-
-
-def giving(state: GraspState) -> Float[Tensor, " n"]:
-    """How far the weight moves or turns the object, of what it may; 0 where it was not tried, at most 2."""
-    share = torch.maximum(state.gave[:, 0] / GIVES, state.gave[:, 1] / TURNS)
-    return share.nan_to_num(0.0).clamp_max(2.0)
-
-
-def lacking_payload(grasps: GraspBatch, needed: float) -> Float[Tensor, " n"]:
-    """By what factor payloads are short of what is needed [kg], as a logarithm; 0 where nothing lacks or it is unknown."""
-    if needed <= 0:
-        return torch.zeros_like(grasps.payload)
-    return (needed / grasps.payload.clamp_min(SHORTEST * needed)).log().clamp_min(0).nan_to_num(0.0)
+    """How grasps are refined after the first closing, and how settled ones squeeze."""
 
 
 def weight_config(problem: GraspProblem, config: SettleConfig) -> WeightConfig:
@@ -93,11 +80,11 @@ def weight_config(problem: GraspProblem, config: SettleConfig) -> WeightConfig:
 
 
 class Settled(NamedTuple):
-    """What became of n grasps, m of which hold still."""
+    """What became of n grasps."""
 
     grasps: GraspBatch  # all of them, in their order
     stable: Bool[Tensor, " n"]  # which ones hold still, with no link too deep in the object or in another
-    state: GraspState  # how these m hold the object
+    known: Evidence  # what closing showed of all of them
 
 
 def can_settle(problem: GraspProblem) -> bool:
@@ -105,15 +92,22 @@ def can_settle(problem: GraspProblem) -> bool:
     return problem.hand.description is not None
 
 
+class SettledBest(NamedTuple):
+    """The better share of n grasps."""
+
+    rows: Int[Tensor, " k"]  # which of the n they are
+    grasps: GraspBatch  # settled, with scores
+    doubts: tuple[str, ...]  # what closing showed against each, in words of DOUBTS; empty for nothing
+
+
 def settle_best(
     problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig | None = None,
     score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
-) -> tuple[Int[Tensor, " k"], GraspBatch]:
-    """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
+) -> SettledBest:
+    """The better share of scored grasps, settled and scored again, in their order.
 
-    The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A
-    grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
-    `unstable_score`.
+    The score counts what closing showed, and on an object seen in part the clearance that the opened hand leaves. A grasp that
+    does not hold still, or ends where the problem's constraints forbid, stays as it was and counts as unstable.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -126,26 +120,30 @@ def settle_best(
     config = config or SettleConfig()
     count = max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, stable, state = settle_grasps(problem, grasps[best], config)
+    closed, stable, known = settle_grasps(problem, grasps[best], config)
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
-    found = scored(problem, closed, score).score
-    needed = weight_config(problem, config).margin * problem.mass
-    held = holding_score(found[stable], state) - config.payload_worth * lacking_payload(closed[stable], needed)
-    # What gives way under its weight is still better than what does not even hold still.
-    found[stable] = torch.maximum(held - config.giving_worth * giving(state), config.unstable_score + held.sigmoid())
-    found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
+    found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
-    return best, closed.replace(score=found)
+    return SettledBest(best, closed.replace(score=found), doubts(known, wrong, config))
+
+
+def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> tuple[str, ...]:
+    """What closing showed against each grasp, in words; empty for nothing."""
+    rules, state = protocol(config.protocol), known.state
+    gives = (state.gave[:, 0] > rules.max_displacement) | (state.gave[:, 1] > rules.max_rotation)
+    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, MOVES: state.shift >= config.farthest,
+             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives}
+    return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
 def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
     """Grasps where closing leaves them, and which of them hold still.
 
-    Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
-    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, loses it at once, or lets
-    links penetrate too deep is returned as it was.
+    Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
+    forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
+    grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -163,13 +161,20 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=weight_config(problem, config))
+    asked = weight_config(problem, config)
+    better = press(hand, obj, better, config.protocol, config=asked)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
     depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    better = better.replace(
-        squeeze_joints=squeeze.joints, squeeze_torque=squeeze.torque, squeeze_force=squeeze.force, payload=squeeze.payload)
-    return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
+    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force)
+    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), better.payload, state)
+    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
+
+
+def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
+    """Largest share of its effort with which a joint squeezes [Nm or N]."""
+    return (torque * hand.movable).abs().div(find_efforts(hand).limit).amax(1)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:

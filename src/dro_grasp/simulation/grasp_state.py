@@ -1,7 +1,4 @@
-"""What holds the object once the hand has closed: the motion that is left, the contacts, and what their forces could answer.
-
-Nothing pushes the object here, so this is no trial; it tells a squeeze that slips from one that grips. Ours.
-"""
+"""What holds the object once the hand has closed: the motion that is left, the contacts, and what the weight then does. Ours."""
 
 from __future__ import annotations
 
@@ -25,6 +22,7 @@ from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, co
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
+from dro_grasp.simulation.trial import held
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
 PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
@@ -56,78 +54,93 @@ class GraspState(Rows):
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
     gave: Float[Tensor, "n 2"]
-    """How far the weight then moves the object [m] and turns it [rad], whichever way it pulls; NaN where it was not tried."""
+    """How far closing and the weight move the object [m] and turn it [rad], whichever way it pulls; NaN where it was not
+    tried."""
 
 
 @dataclass(frozen=True)
 class Squeeze(Rows):
-    """How n hands squeeze, and what comes of it."""
+    """How hard n hands squeeze."""
 
-    joints: Float[Tensor, "n n_dof"]  # targets that press for the object's weight, too [rad or m]
-    torque: Float[Tensor, "n n_dof"]  # what the servos exert there [Nm or N]
-    force: Float[Tensor, " n"]  # sum of the normal forces on the object there [N]
-    payload: Float[Tensor, " n"]  # largest mass that the hand holds where it squeezes for it [kg]
+    torque: Float[Tensor, "n n_dof"]  # what the servos exert [Nm or N]
+    force: Float[Tensor, " n"]  # sum of the normal forces on the object [N]
+
+
+def press(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    config: WeightConfig | None = None, workers: int | None = None
+) -> GraspBatch:
+    """The grasps where closing leaves hand and object, squeezing for the object's weight, with payloads.
+
+    The squeeze is what holds the object still after closing, and in addition torques that press for its weight. A grasp whose
+    closing is unsound, or loses the object, stays where it is. Arguments and errors are those of `simulate`.
+    """
+    config, parts = config or WeightConfig(), [grasps[:0]]
+    for part, rollout in rollouts(scene_of(hand, obj, grasps, protocol), hand, grasps, workers):
+        closed = rollout.close()
+        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
+        joints, poses = held(part, rollout, sound)
+        reached = torch.from_numpy(rollout.poses()[0]).to(joints)
+        chosen = squeezes_of(hand, contact_forces(rollout), reached, part.squeeze_joints, config)
+        targets = _gentle(rollout, chosen, config)
+        still = torch.zeros(len(part)).to(joints)
+        parts.append(part.replace(
+            T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints),
+            payload=payloads(chosen, still, still, config.payload)))
+    return GraspBatch.concatenate(parts)
+
+
+def _gentle(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> Float[Tensor, "n n_dof"]:
+    """Targets that press for the weight [rad or m].
+
+    Where the contacts of a link press harder than they may, the hand presses less, as often as it takes.
+    """
+    mass = torch.from_numpy(rollout.mass).to(chosen.joints)
+    targets, actuated = chosen.targets(mass[:, None])[:, 0], rollout.scene.actuated
+    for _ in range(EASINGS if math.isfinite(config.max_force) else 0):
+        rollout.press(targets.numpy()[:, actuated], config.pressing)
+        peak = torch.tensor([c.hardest_link for c in contact_forces(rollout)]).to(mass)
+        share = (NEARLY * config.max_force / peak.clamp_min(1e-9)).clamp_max(1)
+        if not bool((peak > config.max_force).any()):
+            break
+        targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
+    return targets
 
 
 def grasp_state(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     config: WeightConfig | None = None, workers: int | None = None
 ) -> tuple[GraspState, Squeeze]:
-    """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`.
+    """Close hands as a trial does, look at what holds the object then, and pull at it by its weight.
 
-    The second result is how hard to squeeze for the object's weight.
+    Arguments and errors are those of `simulate`.
     """
     scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
-    nothing = grasps.joints[:0]
-    parts, squeezes = [GraspState(**none)], [Squeeze(nothing, nothing, nothing.sum(1), nothing.sum(1))]
+    parts, squeezes = [GraspState(**none)], [Squeeze(grasps.joints[:0], grasps.joints.new_zeros(0))]
     for part, rollout in rollouts(scene, hand, grasps, workers):
-        closed, state, found = _observed(rollout)
-        joints = torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
-        chosen = squeezes_of(hand, found, joints, part.squeeze_joints, config)
-        pressed, squeeze = _pressed(rollout, chosen, config)
-        able = payloads(chosen, state.shift.to(joints), state.turn.to(joints), config.payload)
-        squeezes.append(replace(squeeze, payload=able))
-        parts.append(replace(state, gave=_pulled(rollout, closed, pressed, config)))
+        closed, state = _observed(rollout)
+        reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
+        squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
+        parts.append(replace(state, gave=_pulled(rollout, closed, config)))
     state, squeeze = (
         type(many[0])(**{f.name: torch.cat([getattr(one, f.name) for one in many]) for f in fields(many[0])})
         for many in (parts, squeezes))
     return state, squeeze
 
 
-def _pressed(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> tuple[ObjectState, Squeeze]:
-    """The object once the hands press for its weight, and how they press.
-
-    Where the contacts of a link press harder than they may, the hand presses less, as often as it takes.
-    """
-    mass = torch.from_numpy(rollout.mass).to(chosen.joints)
-    targets, actuated = chosen.targets(mass[:, None])[:, 0], rollout.scene.actuated
-    for _ in range(EASINGS if math.isfinite(config.max_force) else 1):
-        pressed = rollout.press(targets.numpy()[:, actuated], config.pressing)
-        found = contact_forces(rollout)
-        peak = torch.tensor([c.hardest_link for c in found]).to(mass)
-        share = (NEARLY * config.max_force / peak.clamp_min(1e-9)).clamp_max(1)
-        if not bool((peak > config.max_force).any()):
-            break
-        targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
-    reached = torch.from_numpy(rollout.poses()[0]).to(chosen.joints)
-    torque = servo_torques(chosen.hand, reached, targets, chosen.stiffness)
-    force = torch.tensor([c.pressure.sum() for c in found]).to(mass)
-    return pressed, Squeeze(targets, torque, force, torch.full_like(force, torch.nan))
-
-
-def _pulled(rollout: Rollout, closed: ObjectState, pressed: ObjectState, config: WeightConfig) -> Float[Tensor, "n 2"]:
-    """How far pulls move and turn the object while the hand presses for its weight."""
+def _pulled(rollout: Rollout, closed: ObjectState, config: WeightConfig) -> Float[Tensor, "n 2"]:
+    """How far closing and pulls together move and turn the object; what closing loses is not pulled."""
     if config.pull == 0:
         return torch.full((rollout.size, 2), torch.nan)
-    alive = pressed.stable & (pressed.shift(closed) < LOST_DISTANCE)
-    pulls = Pulls(config.pull * config.gravity, config.pulling, reset=True)
-    moved, turned, _ = rollout.push(pressed, alive, pulls)
+    alive = closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE)
+    pulls = Pulls(config.pull * config.gravity, config.pulling, reset=True, from_start=True)
+    moved, turned, _ = rollout.push(closed, alive, pulls)
     gave = np.stack([np.nan_to_num(moved, nan=LOST_DISTANCE).max(1), np.nan_to_num(turned, nan=np.pi).max(1)], 1)
     return torch.from_numpy(gave).float()
 
 
-def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, list[ContactForces]]:
+def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
@@ -142,7 +155,7 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, list[ContactFo
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
     missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction)
-    return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan)), found
+    return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan))
 
 
 @dataclass(frozen=True)
@@ -170,9 +183,9 @@ class WeightConfig(Checked):
     pull: float = 1.0
     """Multiple of the weight that then pulls along six directions; 0 does not try."""
     pressing: float = 0.2
-    """Time for which the hand presses before [s]."""
-    pulling: float = 0.3
-    """Time of each pull [s]."""
+    """Time after which it counts how hard the hand presses [s]."""
+    pulling: float = 0.2
+    """Time of each pull [s]; what is not held falls 20 cm in it."""
     payload: PayloadConfig = field(default_factory=PayloadConfig)
     """How payloads are predicted."""
 

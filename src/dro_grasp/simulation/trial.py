@@ -136,13 +136,22 @@ def settle(
     scene = scene_of(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
     for part, rollout in rollouts(scene, hand, grasps, workers):
-        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
-        touching = contact_mask(hand, find_contact_links(scene, rollout.qpos))
-        holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
-        joints.append(torch.where(holding, reached, part.joints))
+        held_joints, T_object_wrist = held(part, rollout, torch.from_numpy(rollout.close().stable))
+        joints.append(held_joints)
         poses.append(T_object_wrist)
     unsettled = grasps.without(*PER_JOINT, *CARRYING, "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def held(
+    part: GraspBatch, rollout: Rollout, sound: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
+    """Labels of closed hands, as of `settle`: joints and wrist poses; those of the grasp where the closing is not sound."""
+    hand = rollout.scene.hand
+    reached, T_object_wrist = _reached(part, rollout, hand, sound)
+    touching = contact_mask(hand, find_contact_links(rollout.scene, rollout.qpos))
+    holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
+    return torch.where(holding, reached, part.joints), T_object_wrist
 
 
 def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tensor, " n"]:

@@ -1,4 +1,4 @@
-"""Scores of grasps: the log-odds that they hold, and what is added once a grasp has settled and is seen to hold the object.
+"""Scores of grasps before their closing is simulated: the log-odds that they hold.
 
 Source: the paper's appendix ranks predictions by DexGraspNet's energy and reports the best; the release does not rank.
 """
@@ -21,13 +21,9 @@ from dro_grasp.kinds import Checked
 from dro_grasp.network.checkpoints import SHIPPED_FOLDER, history_of, load_small, save_weights
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.predict.score.features import GRASP_FEATURES, LINK_FEATURES, feature_names, grasp_features
-from dro_grasp.simulation.grasp_state import GraspState
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"  # The network that ships
 FEATURES_KEY = "features"  # What a weights file records of the network's inputs: the list that it was trained with
-SHIPPED_HOLDING = SHIPPED_FOLDER / "ranking" / "holding.safetensors"  # The model that ships
-HOLDING_FEATURES = 11  # Numbers of each grasp that the network sees; see `holding_features`
-LEAST_MOTION = 1e-4  # Motions below this look alike [m, rad, m/s, rad/s] (ours)
 
 
 class ScoreNetwork(nn.Module):
@@ -103,46 +99,3 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
         features = grasp_features(energy, part, terms)  # the network is small and stays on the CPU
         scores.append(network(*(values.cpu() for values in features)).mean(-1))
     return torch.cat(scores)
-
-
-class HoldingScore(nn.Module):
-    """A small network on a dozen numbers of each grasp."""
-
-    mean: Float[Tensor, " features"]  # of each number over the training grasps, as their `deviation`
-    deviation: Float[Tensor, " features"]
-
-    def __init__(self, trials: int, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(HOLDING_FEATURES, width), nn.SiLU(), nn.Linear(width, trials))
-        self.register_buffer("mean", torch.zeros(HOLDING_FEATURES))
-        self.register_buffer("deviation", torch.ones(HOLDING_FEATURES))
-
-    def forward(self, features: Float[Tensor, "n features"]) -> Float[Tensor, "n trials"]:
-        """Log-odds of success in each kind of trial; for the argument see `holding_features`."""
-        return self.layers((features - self.mean) / self.deviation)
-
-
-def holding_features(score: Float[Tensor, " n"], state: GraspState) -> Float[Tensor, "n features"]:
-    """The network's inputs, from what the ranking network says of grasps [log-odds] and how they hold the object."""
-    motion = torch.stack([state.shift, state.turn, state.speed, state.spin], 1).clamp_min(LEAST_MOTION).log()
-    amounts = torch.stack([state.contacts, state.links, state.pressure], 1).log1p()
-    return torch.cat([score[:, None], motion, amounts, state.slip[:, None].clamp_max(2), state.unanswered], 1)
-
-
-@torch.no_grad()
-def holding_score(score: Float[Tensor, " n"], state: GraspState) -> Float[Tensor, " n"]:
-    """Mean log-odds of success in trials; higher is better, comparable among hands and objects. Arguments as above."""
-    return shipped_holding_score()(holding_features(score, state)).mean(1)
-
-
-def load_holding_score(path: Path) -> HoldingScore:
-    """Read a model."""
-    return load_small(
-        path, lambda tensors: HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"])),
-        "a score of settled grasps; train it again (scripts/train_holding_score.py)")
-
-
-@cache
-def shipped_holding_score() -> HoldingScore:
-    """The model that ships, loaded once per process."""
-    return load_holding_score(SHIPPED_HOLDING)
