@@ -34,6 +34,6 @@ for line in dro.check_hand(path).lines():
 hand = dro.load_hand(path)
 obj = dro.load_object("can")
 grasps = dro.synthesize(hand, obj, num=64)[:16]
-result = dro.simulate(hand, obj, grasps, "strict")
+result = dro.simulate(hand, obj, grasps)
 print(f"{int(result.success.sum())} of the best {len(grasps)} synthesized grasps hold; the others fail as follows:")
 print(dict(Counter(failure.value for failure in result.failure if failure)))

@@ -1,4 +1,4 @@
-"""The same grasps under three protocols, beside a control: open hands at the object, never optimised."""
+"""The same grasps under four protocols, beside a control: open hands at the object, never optimised."""
 
 import dro_grasp as dro
 
@@ -9,7 +9,7 @@ sets = {
     "predicted, not refined": dro.GraspPredictor().predict(hand, obj, num=24, refine=False),
     "never optimised": dro.palm_facing_starts(hand, obj, num=24, seed=0),
 }
-for protocol in ("dro", "strict", "dexgraspbench"):
+for protocol in ("dro", "strict", "dexgraspbench", "carry"):
     for name, grasps in sets.items():
         success = int(dro.simulate(hand, obj, grasps, protocol).success.sum())
         low, high = dro.wilson_interval(success, grasps.out_of)  # of what was asked for: grasps that were not found have failed

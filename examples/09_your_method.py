@@ -33,6 +33,6 @@ if __name__ == "__main__":
     for source in ("pinch", "start", "auto"):
         for refine in (False, True):
             grasps = predictor.predict(hand, obj, 8, refine=refine, source=source)
-            held = {rules: int(dro.simulate(hand, obj, grasps, rules).success.sum()) for rules in ("dro", "strict")}
+            held = {rules: int(dro.simulate(hand, obj, grasps, rules).success.sum()) for rules in ("strict", "carry")}
             how = "finished" if refine else "as proposed"
-            print(f"{source:5} {how:11} of 8 grasps, {held['dro']} hold under dro, {held['strict']} under strict")
+            print(f"{source:5} {how:11} of 8 grasps, {held['strict']} hold under strict, {held['carry']} under carry")

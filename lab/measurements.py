@@ -20,12 +20,14 @@ UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgr
 """Hands that no weights were trained on."""
 OBJECTS = {"validate": "assets:validate", "test": "builtin:test"}
 """Objects that no weights were trained on: the paper's, by which the form of the network was once chosen, and built-in ones."""
+HARD = "builtin:hard_test"
+"""Thin, flat, hollow, small, large and heavy ones, by which nothing was chosen."""
 MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
 """Built-in arms with hands."""
-FAST, ALL = "dro strict dexgraspbench", "dro strict dexgraspbench robust"
-"""Protocols: those of one trial a grasp, and with the one of eight."""
+FAST, ALL = "carry dexgraspbench strict", "carry robust dexgraspbench strict"
+"""Protocols: those of one trial a grasp, and with the one of eight. Beside the paper stands its own as well: `dro`."""
 CORE = ("devices.py", "frames.py", "kinds.py", "geometry", "network", "objects", "hands", "distance_matrix.py", "grasps",
         "optimize", "simulation", "predict")
 """What turns a hand and an object into grasps and tries them; all measurements rest on it."""
@@ -63,9 +65,9 @@ def _headline() -> dict[str, str]:
         for hand in PAPER_HANDS:
             name = f"{where}, {_short(hand)}"
             cells[f"{name}, returned"] = _benchmark(
-                "auto", hand, objects, f"--num 48 --stages returned --protocols {ALL}")
+                "auto", hand, objects, f"--num 32 --stages returned --protocols {ALL} dro")
             cells[f"{name}, stages"] = _benchmark(
-                "network", hand, objects, f"--num 20 --stages raw refined settled --protocols {FAST}")
+                "network", hand, objects, f"--num 12 --stages raw refined settled --protocols {FAST} dro")
             cells[f"{name}, controls"] = _benchmark(
                 "auto optimiser start mean-grasp", hand, objects,
                 f"--num 16 --stages equal-time --protocols {FAST} --bundle {PREPARED}/bundle.safetensors")
@@ -101,7 +103,14 @@ MEASUREMENTS = {
         for i in range(MADE_HANDS)}),
     "published": Measurement("Hands as others publish them, on the built-in test objects", {
         name: _benchmark("auto", shlex.quote(f"{PREPARED}/published/{path}"), OBJECTS["test"],
-                         f"--num 8 --stages returned --protocols {ALL}")
+                         f"--num 16 --stages returned --protocols {ALL}")
+        for name, path in PUBLISHED.items()}),
+    "hard": Measurement("The paper's hands on hard objects", {
+        _short(hand): _benchmark("auto", hand, HARD, f"--num 32 --stages returned --protocols {ALL}")
+        for hand in PAPER_HANDS}),
+    "published_hard": Measurement("Hands as others publish them, on hard objects", {
+        name: _benchmark("auto", shlex.quote(f"{PREPARED}/published/{path}"), HARD,
+                         f"--num 32 --stages returned --protocols {ALL}")
         for name, path in PUBLISHED.items()}),
     "confidence": Measurement(
         "Whether confidence is how often grasps hold, on hands and objects that no weights were trained on", _confidence()),
@@ -117,17 +126,18 @@ MEASUREMENTS = {
         name: "python -m lab.benchmarks.constraints --cases " + shlex.quote(name) + " --json"
         for name in ("nothing", "direction", "max_tilt", "obstacles", "contact_region", "keep_out", "pregrasp_clearance")}),
     "tables": Measurement("Objects that rest on a table, from above and from the side", {
-        hand: f"python -m lab.benchmarks.tabletop --hands {hand} --objects builtin:test --num 8 --trials --json"
+        hand: f"python -m lab.benchmarks.tabletop --hands {hand} --objects builtin:test --num 8 --trials carry --json"
         for hand in ("allegro", "barrett")}),
     "methods": Measurement("Methods of others, written anew here, beside ours", {
         f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages raw returned "
-                                                f"--protocols {FAST}")
+                                                f"--protocols {FAST} dro")
         for hand in PAPER_HANDS
         for method, source, num in (
             ("DFC", "dfc", 8), ("GenDexGrasp", "lab.methods.gendexgrasp:GenDexGrasp", 4),
             ("ManiFM-style", "lab.methods.manifm:ContactMethod", 8))
         if method != "ManiFM-style" or "allegro" in hand}),
-    "fidelity": Measurement("The paper's own form, slim, trained as far as an hour of one core goes", {
+    "fidelity": Measurement("The paper's own form, slim, trained as far as an hour of one core goes; and finer simulation", {
+        "simulation": "python -m lab.benchmarks.agreement --num 8 --json",
         "trained": f"python -m lab.studies.paper_form --bundle {PREPARED}/bundle.safetensors --output {PREPARED}/paper_form "
         "--rows pretrained --seeds 0 --steps 1500 --pretraining-steps 500 --num 8 --json"}, wings=("compare", "training")),
     "data": Measurement("The grasps that ship with the repository", {
@@ -135,8 +145,8 @@ MEASUREMENTS = {
         "again": "python -m lab.benchmarks.dataset data/grasps --sample 60 --json"}, wings=("compare", "training")),
     "speed": Measurement("Times on the processor, nothing beside", {
         name: f"python -m lab.benchmarks.{name} {options}--json" for name, options in (
-            ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", ""),
-            ("synthesis", ""))}, wings=("compare", "training", "cli"), alone=True),
+            ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", "--protocol carry "),
+            ("synthesis", "--protocol carry "))}, wings=("compare", "training", "cli"), alone=True),
     "gpu": Measurement("Times on a GPU", {
         "device": "python -m lab.benchmarks.device --quick --json"}, wings=("training",), alone=True, device="cuda"),
 }

@@ -17,6 +17,7 @@ import dro_grasp as dro
 from dro_grasp.objects.catalogue import resolve_objects
 from dro_grasp.pictures.appearance import success_colour
 from dro_grasp.pictures.sheets import after_closing, draw_grasp, outcome
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
 HANDS = ("allegro", "barrett", "gripper3", "leaphand", "shadowhand",
          *(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper")))
@@ -54,7 +55,7 @@ def main() -> None:
                 picture = draw_grasp(hand, obj, after_closing(hand, obj, grasps), 0, dro.PictureStyle(TILE))
                 sheet.paste(Image.fromarray(picture), (x, y))
                 dots.append((x + 4, y + 4, outcome(grasps, 0)))
-        print(f"{hand.name}: {held} of {(row + 1) * len(objects)} so far hold under strict", flush=True)
+        print(f"{hand.name}: {held} of {(row + 1) * len(objects)} so far hold under {DEFAULT_PROTOCOL}", flush=True)
     finished(sheet, dots).save(options.output, optimize=True)
 
 

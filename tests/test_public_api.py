@@ -92,7 +92,7 @@ def test_hand_in_object_in_grasps_out(tmp_path: Path) -> None:
     grasps = predictor.predict(hand, obj, num=4)
     result = dro.simulate(hand, obj, grasps)
     evaluated = grasps.with_trial(result)
-    assert dro.evaluate(dro.GraspProblem(hand, obj), grasps).protocol == evaluated.protocol == ("strict/1",) * 4
+    assert dro.evaluate(dro.GraspProblem(hand, obj), grasps).protocol == evaluated.protocol == ("carry/1",) * 4
     chosen = evaluated[evaluated.success]
     assert len(chosen) == int(result.success.sum())
     evaluated.save(tmp_path / "grasps.parquet")

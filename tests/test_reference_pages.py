@@ -30,7 +30,7 @@ from dro_grasp.predict.sources.choice import ChoiceConfig, ChoicePenalties
 from dro_grasp.simulation.contacts import NAMES
 from dro_grasp.simulation.grasp_state import CHANGE, LEVER, PUSH, UNIT
 from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE
-from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.training.config import LossConfig, MotionConfig
 
@@ -62,7 +62,7 @@ def numbers(rules: Protocol) -> dict[str, str]:
         "time to close [s]": number(rules.closing_time),
         "servo stiffness [Nm/rad]": number(rules.stiffness),
         "servo damping [Nms/rad]": number(rules.damping),
-        "largest servo torque [Nm]": number(rules.force_limit),
+        "largest servo torque [Nm]": "the joint's effort" if rules.effort else number(rules.force_limit),
         "displacement, under [cm]": number(rules.max_displacement, 0.01),
         "rotation, under [degrees]": number(rules.max_rotation, degree),
         "displacement while closing, at most [cm]": number(min(rules.max_closing_shift, LOST_DISTANCE), 0.01),
@@ -74,7 +74,7 @@ def numbers(rules: Protocol) -> dict[str, str]:
 
 
 def test_the_table_of_protocols_has_the_numbers_of_the_code() -> None:
-    (heading, *rows) = table("conventions.md", "| | `dro`")
+    (heading, *rows) = table("conventions.md", "| | `carry`")
     names = [re.findall(r"`(\w+)`", cell) for cell in heading[1:]]
     assert sorted(name for group in names for name in group) == sorted(PROTOCOLS)
     for column, group in enumerate(names, 1):
@@ -94,6 +94,8 @@ def test_the_text_about_protocols_has_the_numbers_of_the_code() -> None:
     page = " ".join((DOCS / "conventions.md").read_text().split())
     assert "**`strict` pushes with a twentieth of gravity.**" in page
     assert 9.81 / 20 == pytest.approx(PROTOCOLS["strict"].force, rel=0.02)
+    assert PROTOCOLS["carry"].force == 9.81, "the page says: the object's own weight"
+    assert [n for n, rules in PROTOCOLS.items() if rules.effort] == ["carry"] == [DEFAULT_PROTOCOL]
     rules = PROTOCOLS["robust"].perturbations
     assert f"must hold in {rules.needed} of {rules.trials} trials" in page
     assert f"stands {rules.shift * 1e3:g} mm away and is turned by {math.degrees(rules.turn):g} degrees" in page
@@ -103,7 +105,7 @@ def test_the_text_about_protocols_has_the_numbers_of_the_code() -> None:
     assert rules.coarse == 4, "the page says: in the last four trials"
     assert Protocol("mine").lever == 0.03, "the page says: a lever of 3 cm"
     assert [n for n, rules in PROTOCOLS.items() if not rules.closing] == ["dro_static"]
-    assert [n for n, rules in PROTOCOLS.items() if rules.gradual] == ["dexgraspbench"]
+    assert [n for n, rules in PROTOCOLS.items() if rules.gradual] == ["carry", "dexgraspbench"]
 
 
 def test_the_page_of_errors_has_every_error() -> None:

@@ -31,12 +31,11 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_names
 from dro_grasp.predict.stages import evaluate
+from dro_grasp.simulation.protocols import PROTOCOLS
 from lab.benchmarks.report import emit
 
 DIRECTIONS = {"above": (0.0, 0.0, -1.0), "side": (1.0, 0.0, 0.0)}
 """Palm directions."""
-PROTOCOL = "strict"
-"""Protocol of the trials; none has a table."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,9 @@ def _heights(poses: Float[np.ndarray, "n 4 4"], vertices: Float[np.ndarray, "v 3
     return poses[:, 2, :3] @ vertices.T + poses[:, 2, 3:]
 
 
-def measure(predictor: GraspPredictor, hand: Hand, obj: ObjectModel, side: str, request: GraspRequest, trials: bool) -> Row:
+def measure(
+    predictor: GraspPredictor, hand: Hand, obj: ObjectModel, side: str, request: GraspRequest, protocol: str | None
+) -> Row:
     """Predict, and look at what came back."""
     direction = DIRECTIONS[side]
     problem = GraspProblem(hand, obj, constraints=Constraints(direction, table=0.0))
@@ -96,7 +97,7 @@ def measure(predictor: GraspPredictor, hand: Hand, obj: ObjectModel, side: str, 
     grasps = predictor.run(problem, request).grasps
     seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
     palm = hand.palm_directions(grasps.T_object_wrist) @ torch.tensor(direction)
-    held = int(evaluate(problem, grasps, PROTOCOL).success.sum()) if trials else None
+    held = int(evaluate(problem, grasps, protocol).success.sum()) if protocol else None
     return Row(hand.name, obj.name, problem.height_range[1], side, len(grasps), seconds, cpu, lowest_vertex(hand, grasps),
                float(torch.acos(palm.clamp(-1, 1)).median()), held)
 
@@ -108,7 +109,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), help="the usual built-in ones by default")
     parser.add_argument("--source", choices=(AUTO, *source_names()), default=AUTO)
     parser.add_argument("--num", type=int, default=16, help="grasps that are asked for")
-    parser.add_argument("--trials", action="store_true", help=f"also evaluate under {PROTOCOL}")
+    parser.add_argument("--trials", choices=list(PROTOCOLS), help="also evaluate under a protocol; none has a table")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     predictor, request = GraspPredictor(), GraspRequest(options.num, source=options.source)

@@ -1,10 +1,10 @@
-"""Trials per second under protocol `dro`, by wall clock on all cores, and the slowest objects.
+"""Trials per second under a protocol, by wall clock on all cores, and the slowest objects.
 
 The grasps are synthesized, so most trials run to their end; a trial that fails early is cheaper. The time is that of
 `simulate`, including penetration and scene building (64 grasps per pair with `--full`, otherwise 16), but not the loading of
 hands and objects.
 
-    python -m lab.benchmarks.trials [--json] [--full] [--seed 0] [--protocol dro] [--workers N]
+    python -m lab.benchmarks.trials [--json] [--full] [--seed 0] [--protocol carry] [--workers N]
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.simulation.trial import TrialResult, simulate
 from lab.benchmarks.report import emit
 
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--full", action="store_true", help=f"{FULL} grasps a pair instead of {SAMPLE}")
     parser.add_argument("--seed", type=int, default=0, help="of the synthesis")
-    parser.add_argument("--protocol", default="dro", choices=list(PROTOCOLS))
+    parser.add_argument("--protocol", default=DEFAULT_PROTOCOL, choices=list(PROTOCOLS))
     parser.add_argument("--workers", type=int, default=cores(), help="threads")
     options = parser.parse_args()
     if "DRO_GRASP_ASSETS" not in os.environ:
@@ -104,7 +104,7 @@ def main() -> None:
         f"{options.seed}) of each of the paper's 10 validation objects, {options.workers} threads",
         [row(hand, of_hand) for hand, of_hand in runs.items()],
         ["hand", "trials", "trials/s", "CPU [ms]", "slowest object", "there", "success [%]", "failures"],
-        {"trials_per_second": rate(everything), "per_hand": {h: rate(r) for h, r in runs.items()},
+        {"protocol": options.protocol, "trials_per_second": rate(everything), "per_hand": {h: rate(r) for h, r in runs.items()},
          "cpu_milliseconds_per_trial": cpu * 1e3, "workers": options.workers}, options.json,
     )
 

@@ -60,12 +60,12 @@ def test_the_viewer_asks_for_what_the_command_asks(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate])
-def test_trials_are_strict_unless_another_protocol_is_named(function: Callable[..., Any]) -> None:
-    assert default(function, "protocol") == DEFAULT_PROTOCOL == "strict"
+def test_trials_are_those_of_what_lifts_things_unless_another_protocol_is_named(function: Callable[..., Any]) -> None:
+    assert default(function, "protocol") == DEFAULT_PROTOCOL == "carry"
 
 
 def test_so_are_those_of_generate() -> None:
-    assert Generate(hand="gripper3", object="sphere")._protocol(load_object("sphere")) == "strict"
+    assert Generate(hand="gripper3", object="sphere")._protocol(load_object("sphere")) == "carry"
 
 
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,7 +71,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
         "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "trial", "files", "total"}
     parts = sum(value for name, value in report["seconds"].items() if name != "total")
     assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
-    assert (report["num"], report["protocol"]) == (3, "strict")
+    assert (report["num"], report["protocol"]) == (3, "carry")
     assert report["candidates"] >= 12  # four of the network for each, and those of the optimiser
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)
@@ -182,7 +182,7 @@ def stored(folder: Path, holding: bool) -> Path:
         found = refine(GraspProblem(hand, sphere), synthesize(hand, sphere, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
         # As `generate` gets them without refinement: the controller makes pregrasp and squeeze.
         two = found.poses_only().without("pregrasp_joints", "squeeze_joints")
-        two = two[simulate(hand, sphere, two, "strict").success][:2]
+        two = two[simulate(hand, sphere, two).success][:2]
     else:
         two = palm_facing_starts(hand, sphere, 2, 0)
         away = two.T_object_wrist.clone()
@@ -215,7 +215,7 @@ def test_grasps_that_were_not_found_count_as_failures(
     low, high = wilson_interval(2, 16)
     assert report["interval_95"] == pytest.approx([low, high])
     assert GraspBatch.load(path).asked == 16
-    assert "2 of 16 hold under strict/1" in repr(GraspBatch.load(path))
+    assert "2 of 16 hold under carry/1" in repr(GraspBatch.load(path))
     told = generate("--output", str(folder / "few.parquet"), "--only-successful", "--no-refine", num=16, source=two)
     assert told["success_rate"] == pytest.approx(2 / 16)
     assert GraspBatch.load(folder / "few.parquet").asked is None, "what was chosen by its outcome is no answer"

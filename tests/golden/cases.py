@@ -47,8 +47,20 @@ def trials(name: str) -> Numbers:
     hand, obj = dro.load_hand("gripper3"), dro.load_object("can")
     made = dro.synthesize(hand, obj, 20, seed=0, config=dro.SynthesisConfig(steps=40))
     result = dro.simulate(hand, obj, made, name)
+    return outcome(result)
+
+
+def outcome(result: dro.TrialResult) -> Numbers:
+    """What a trial says."""
     return {"success": result.success.double().tolist(), "displacement": result.displacement.double().flatten().tolist(),
             "penetration": result.penetration.double().tolist()}
+
+
+def carried(name: str) -> Numbers:
+    """Outcomes under `carry` of what is returned, and of what nobody refined: some hold, some do not."""
+    hand, obj, predictor = dro.load_hand(name), dro.load_object("can"), dro.GraspPredictor()
+    made = dro.GraspBatch.concatenate([predictor.predict(hand, obj, num=4, seed=1, refine=refined) for refined in (True, False)])
+    return outcome(dro.simulate(hand, obj, made, "carry"))
 
 
 def training() -> Numbers:
@@ -70,6 +82,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "grasps of a cloud": lambda: grasps("barrett", partial_view(dro.load_object("mug"), "depth", 0)),
     "grasps from above": lambda: grasps("leaphand", dro.load_object("can"), direction=(0.0, 0.0, -1.0), table=-0.06),
     **{f"trials under {name}": lambda name=name: trials(name) for name in PROTOCOLS},
+    "what is carried": lambda: carried("barrett"),
     "training": training,
 }
 

@@ -82,12 +82,13 @@ def test_a_firm_pinch_answers_what_a_loose_one_and_one_finger_cannot() -> None:
     assert none == NO_ANSWER
 
 
-def test_motion_and_contacts_are_those_of_a_trial(hand: Hand, obj: ObjectModel) -> None:
+@pytest.mark.parametrize("name", ["carry", "strict"])
+def test_motion_and_contacts_are_those_of_a_trial(hand: Hand, obj: ObjectModel, name: str) -> None:
     grasps = power_grasp(hand, obj, 2)
     T = grasps.T_object_wrist.clone()
     T[1, 2, 3] -= 0.01
     grasps = grasps.replace(T_object_wrist=T)
-    (found, _), trial = grasp_state(hand, obj, grasps), simulate(hand, obj, grasps, "strict")
+    (found, _), trial = grasp_state(hand, obj, grasps, name), simulate(hand, obj, grasps, name)
     torch.testing.assert_close(found.shift, trial.closing_shift)
     torch.testing.assert_close(found.turn, trial.closing_rotation)
     assert found.links.tolist() == [len(links) for links in trial.contact_links]

@@ -40,7 +40,7 @@ def small(home: Path, **more: object) -> OnboardingConfig:
     """Small shards, and few grasps in the report."""
     given = OnboardingConfig(
         0.01, ("sphere",), ("can",), 2, str(home / "untrained.safetensors"), 1, "network", grasps_drawn=3,
-        engine=EngineConfig(candidates=32, min_candidates=32))
+        engine=EngineConfig("strict", candidates=32, min_candidates=32))
     return replace(given, **more)
 
 
@@ -71,13 +71,13 @@ def test_a_file_becomes_weights_and_a_report(home: Path, made: Onboarded) -> Non
     page = write_report(made).read_text()
     assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
-    assert f"{made.rate('after', 'refined', 'strict/1'):.0%} after" in page
+    assert f"{made.rate('after', 'refined', 'carry/1'):.0%} after" in page
     for step in ("before", "after"):
-        returned = f"{made.rate(step, 'returned', 'strict/1'):.0%} {step}"
+        returned = f"{made.rate(step, 'returned', 'carry/1'):.0%} {step}"
         assert f"{returned} ({made.optimised(step):.0%} of them made by the optimiser)" in page
     assert " of 3 made by the optimiser" in page
     for row in json.loads((home / "out" / onboarding.STATE).read_text())["steps"]["after"]["rows"]:
-        share, everyone = row["fingers"]["strict/1"]
+        share, everyone = row["fingers"]["carry/1"]
         assert f"{100 * share:.0f} ({100 * everyone:.0f})" in page
     assert f"--weights {made.weights}" in page
 
@@ -95,7 +95,7 @@ def test_a_rerun_does_nothing_again(home: Path, made: Onboarded, capsys: pytest.
     assert told["without_grasps"] == []
     assert told["report"] == str(home / "out" / "report.html")
     for step in ("before", "after"):
-        assert told[step]["returned"]["strict/1"] == made.rate(step, "returned", "strict/1")
+        assert told[step]["returned"]["carry/1"] == made.rate(step, "returned", "carry/1")
         assert told["optimised"][step] == made.optimised(step)
 
 
@@ -135,7 +135,7 @@ def test_a_run_that_stopped_goes_on(home: Path) -> None:
 
 
 def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> Onboarded:
-    rows = [[{"stage": stage, "asked": asked, "held": {"strict/1": held}, "success": {"strict/1": (held / asked, 0, 1)}}
+    rows = [[{"stage": stage, "asked": asked, "held": {"carry/1": held}, "success": {"carry/1": (held / asked, 0, 1)}}
              for stage in ("raw", "refined")] for held in (before, after)]
     return Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made},
                            OnboardingConfig(weights="multi"))
@@ -150,7 +150,7 @@ def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Pat
     assert "No training grasps of box, torus" in told
     assert done.gained == (after == 90)
     assert done.weights == (str(home / "weights.safetensors") if done.gained else "multi")
-    said = f"gained nothing beyond chance: 60 of 200 of the refined grasps hold under strict/1 before, {after} of 200 after"
+    said = f"gained nothing beyond chance: 60 of 200 of the refined grasps hold under carry/1 before, {after} of 200 after"
     assert (said in told) != done.gained
 
 

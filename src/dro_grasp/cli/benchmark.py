@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dro_grasp.compare.rows import Row
     from dro_grasp.objects.shape import ObjectModel
 
-QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
+QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("carry", "strict")}
 """What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
 
 
@@ -46,7 +46,7 @@ class Benchmark:
     """What is done to the grasps before the trials. refined and settled report all grasps, and the best by score. settled:
     refined grasps after their closing was simulated. returned: what `generate --source` returns. equal-time: every method
     gets as much CPU time a grasp as the first."""
-    protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
+    protocols: tuple[ProtocolName, ...] = ("carry", "dexgraspbench", "strict")
     """Protocols of the trials. Displacement, rotation and diversity are means over the successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights of the network.
     device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
@@ -60,10 +60,13 @@ class Benchmark:
     contact_quality: Flag = False
     """Also measure the analytic metrics of DexGraspBench, with its friction: penetration, contact distance, force closure."""
     quick: Flag = False
-    """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
+    """A first look: what the methods return, four grasps of each hand on the first two objects, under carry and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What methods, refinement and ranking see: the mesh (whole), its points (cloud), half of them as in the paper (half), or
     a depth image (depth)."""
+    mass: Mass = None  # Mass of every object [kg].
+    margin: Annotated[float | None, optional("TIMES", "1.5")] = None  # Multiple of the weight that squeezes hold.
+    max_force: Annotated[float | None, optional("N", "any")] = None  # Largest normal force of a contact at the squeeze [N].
     views: int = 1  # Views of each object for each hand, with --num grasps each.
     seed: int = 0  # The same seed gives the same grasps and views.
     json: Flag = False  # Print one JSON object instead of a Markdown table.
@@ -75,6 +78,7 @@ class Benchmark:
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predict.config import GraspRequest
+        from dro_grasp.predict.constraints import Constraints
         from dro_grasp.simulation.protocols import protocol
 
         if self.quick:
@@ -95,8 +99,8 @@ class Benchmark:
         stages = tuple(name for stage in self.stages for name in (stage, *further.get(stage, ())))
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), seed=self.seed, view=self.view,
-            views=self.views, device=self.device, contact_quality=self.contact_quality,
-        )
+            views=self.views, device=self.device, contact_quality=self.contact_quality, mass=self.mass,
+            constraints=Constraints(margin=self.margin, max_force=self.max_force))
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, methods, config, progress)
         if not rows:

@@ -13,6 +13,7 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
     from dro_grasp.training.data.collections.collection import PairGrasps
@@ -43,7 +44,7 @@ class Synthesize:
     device: str = "cpu"  # Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
     scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
     seed: int = 0  # The same seed gives the same grasps.
-    protocol: ProtocolName = "strict"  # Protocol of the trial that grasps must pass.
+    protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial that grasps must pass.
     idle: float = 0.6
     """Probability, 0 to 1, that a finger other than the thumb need not touch. Lower values give fuller grasps, and fewer."""
     keep_idle_fingers: Flag = False
@@ -260,7 +261,8 @@ class Check(DataSets):
     """
 
     sample: int = 100  # Grasps to evaluate, drawn uniformly from all grasps.
-    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    protocol: Annotated[ProtocolName | None, optional(f"{{{','.join(PROTOCOLS)}}}", "the stored one")] = None
+    """Protocol of the trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
     mass_factor: float = 1.0  # Factor for the masses of the objects, and thereby for the forces.
     seed: int = 0  # Seed of the sample.
@@ -270,11 +272,12 @@ class Check(DataSets):
         """Draw, evaluate, compare."""
         from dro_grasp.compare.metrics import wilson_interval
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.training.data.collections.checking import check
+        from dro_grasp.training.data.collections.checking import check, stored_protocol
 
-        rules = changed(self.protocol, friction=self.friction, mass_factor=self.mass_factor)
+        pairs = list(self.pairs(only_successful=False))
+        rules = changed(self.protocol or stored_protocol(pairs), friction=self.friction, mass_factor=self.mass_factor)
         with progress_bar("evaluating", self.json) as progress:
-            found = check(self.pairs(only_successful=False), self.sample, rules, self.seed, progress)
+            found = check(pairs, self.sample, rules, self.seed, progress)
         low, high = wilson_interval(found.agreed, found.evaluated)
         rows = [[hand, n, success, success / n] for hand, (n, success) in found.hands.items()]
         values = {
@@ -293,11 +296,11 @@ class Check(DataSets):
 class Filter(DataSets):
     """Evaluate all grasps of a data set, and keep those that pass.
 
-    Example: dro-grasp dataset filter theirs.parquet --protocol strict --output kept
+    Example: dro-grasp dataset filter theirs.parquet --protocol robust --output kept
     """
 
     output: Path  # Folder for the files, one per hand; created if missing.
-    protocol: ProtocolName = "strict"  # Protocol of the trial.
+    protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial.
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
     close_fingers: Flag = False  # Close idle fingers onto the object where the grasp still passes.
     json: Flag = False  # Print one JSON object instead of a table.

@@ -16,8 +16,10 @@ from dro_grasp.hands.hand import Hand
 TIP_FORCE = 10.0
 """Force that a finger exerts with its tip, where nothing better is known [N]. Ours: makers of hands state 5 to 20 N."""
 GRIP_FORCE = 40.0  # Force of a jaw that slides, likewise [N]. Ours: makers of electric grippers state 20 to 140 N
-LEAST, MOST = 0.1, 40.0
-"""Multiples of what suits the hand's size within which an effort is believed. Ours: files state 0 and 1000 for none."""
+LEAST = 0.1
+"""Least multiple of what suits the hand's size at which an effort is believed. Ours: files state 0 for none."""
+MOST = 40.0
+"""Largest such multiple. Ours: files state 1000 for none."""
 SHORTEST = 0.01  # Least lever arm from a joint to its fingertip [m] (ours)
 
 

@@ -25,7 +25,7 @@ class GraspProblem:
 
     Examples:
         >>> problem = GraspProblem(load_hand("allegro"), load_object("mug"))
-        >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
+        >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "carry")
     """
 
     hand: Hand

@@ -1,7 +1,8 @@
 """Settling: the closing of the hand is simulated until it leaves the object where it is.
 
-In contact simulation, fingers and object find the places that geometry alone gets wrong by millimetres. No force is tried on
-the object, so this is no trial; it needs the hand's description. Balls stand for a bare cloud. Ours.
+In contact simulation, fingers and object find the places that geometry alone gets wrong by millimetres, and the weight then
+pulls at the object as in a trial under `carry`, for a fifth of the time. Needs the hand's description. Balls stand for a bare
+cloud. Ours.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, renamed
@@ -27,7 +29,7 @@ from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import hand_shift, settle
 
@@ -55,17 +57,26 @@ class SettleConfig(Checked):
     lost: float = 0.05
     """An object that moves farther than this is lost [m]."""
     farthest: float = 0.02
-    """How far it may move the second time [m]."""
+    """How far it may move the last time [m]."""
     largest_turn: float = math.radians(30)
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    closing: str = "strict"
+    """Physics of the first closing, which says where a grasp ends: fingers as strong as each other."""
     protocol: str = "carry"
-    """Physics of the second closing, and of the pulls after it."""
+    """Physics of the later closings, and of the pulls after them."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
-    """How grasps are refined between the two closings, and how settled ones squeeze."""
+    """How grasps are refined after the first closing, and how settled ones squeeze."""
+
+
+def weight_config(problem: GraspProblem, config: SettleConfig) -> WeightConfig:
+    """How hard grasps press, as the problem asks."""
+    asked = problem.constraints
+    given = {"margin": asked.margin, "max_force": asked.max_force}
+    return replace(config.weight, **{name: value for name, value in given.items() if value is not None})
 
 
 class Settled(NamedTuple):
@@ -130,9 +141,9 @@ def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> 
 def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
     """Grasps where closing leaves them, and which of them hold still.
 
-    Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
-    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, loses it at once, or lets
-    links penetrate too deep is returned as it was.
+    Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
+    forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
+    grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -144,31 +155,32 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     """
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
     grasps = complete(problem, grasps.without("score"))
-    closed = settle(hand, obj, grasps)
+    closed = settle(hand, obj, grasps, config.closing)
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=config.weight)
-    depth = deepest_penetration(hand, obj, better)
+    asked = weight_config(problem, config)
+    better = press(hand, obj, better, config.protocol, config=asked)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
+    depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    better = better.replace(squeeze_joints=squeeze)
-    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(problem.hand, better, config), state)
+    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force)
+    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), better.payload, state)
     return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
 
 
-def effort_share(hand: Hand, grasps: GraspBatch, config: SettleConfig) -> Float[Tensor, " n"]:
-    """Largest share of its effort with which a joint squeezes."""
-    torque = config.weight.stiffness * (grasps.squeeze_joints - grasps.joints) / hand.tree.joint_unit**2
+def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
+    """Largest share of its effort with which a joint squeezes [Nm or N]."""
     return (torque * hand.movable).abs().div(find_efforts(hand).limit).amax(1)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:
-    """The batch with other poses, joints and targets in these rows."""
+    """The batch with other poses, joints, targets and forces in these rows."""
     values = {}
-    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
+    for name in ("T_object_wrist", "joints", *PER_JOINT, *CARRYING):
         values[name] = getattr(grasps, name).clone()
         values[name][rows] = getattr(others, name)
     return grasps.poses_only().replace(**values)

@@ -161,6 +161,23 @@ class Rollout:
         self._advance(np.arange(self.size), self._steps(seconds))
         return self.observe()
 
+    def load(
+        self, targets: Float[np.ndarray, "n n_servos"], force: Float[np.ndarray, "n 3"], seconds: float
+    ) -> ObjectState:
+        """Press towards targets under a force on each object [N], in the frame that it had at the start, for a time [s]."""
+        self.force[:, self.scene.object_body, :3] = np.einsum("nij,nj->ni", self.start.rotation, force)
+        return self.press(targets, seconds)
+
+    def moment(self) -> dict[str, Float[np.ndarray, "n k"]]:
+        """What it takes to go on from here later; see `go_back`."""
+        return {name: np.array(self.batch.bind(name)) for name in STATE}
+
+    def go_back(self, moment: dict[str, Float[np.ndarray, "n k"]]) -> None:
+        """Return all trials to an earlier moment, without forces."""
+        self.force[:] = 0
+        for name, values in moment.items():
+            self.batch.bind(name)[:] = values
+
     def push(
         self, closed: ObjectState, alive: Bool[np.ndarray, " n"], pulls: Pulls | None = None
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:
@@ -180,7 +197,7 @@ class Rollout:
                 break
             for name, values in state.items():
                 self.batch.bind(name)[rows] = values[rows]
-            self._set_force(axis * pulls.acceleration, rows)
+            self._set_force(axis, pulls.acceleration, rows)
             self._advance(rows, self._steps(pulls.seconds))
             now = self.observe(rows)
             # Later columns keep these values unless the trial goes on.
@@ -225,9 +242,10 @@ class Rollout:
     def _steps(self, seconds: float) -> int:
         return round(seconds / self.scene.protocol.timestep)
 
-    def _set_force(self, acceleration: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
-        """Apply a force per mass [m/s^2] in the object's frame, as the object was oriented at the start."""
-        self.force[rows, self.scene.object_body, :3] = self.mass[rows, None] * (self.start.rotation[rows] @ acceleration)
+    def _set_force(self, axis: Float[np.ndarray, "3"], acceleration: float, rows: Int[np.ndarray, " k"]) -> None:
+        """Apply a force per mass [m/s^2] along an axis of the object's frame, as the object was oriented at the start."""
+        newtons = acceleration * self.mass[rows, None]
+        self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
 
     def _advance(self, rows: Int[np.ndarray, " k"], steps: int) -> None:
         """Let time pass in some of the trials, and record it if asked to; recording does not change the motion."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
@@ -50,7 +51,7 @@ def simulate(
     results, done = [], 0
     for part, rollout in rollouts(scene, hand, grasps, workers):
         penetration = measure_penetration(scene, part)
-        result = _run(rollout, penetration)
+        result = run_trial(rollout, penetration)
         if scene.protocol.perturbations.trials > 1:
             result = _repeated(scene, part, result, penetration, workers)
         results.append(result)
@@ -75,13 +76,14 @@ def record(
     if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1).shown):
         conditions = draw(scene.protocol.perturbations, grasp).rows(slice(shown - 1, shown))
         rollout = Rollout(_scene_of_trial(scene, shown), grasp, workers=1, stride=stride, conditions=conditions)
-    _run(rollout, penetration)
+    run_trial(rollout, penetration)
     joints, poses = (
         torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*rollout.frames, strict=True))
     return poses, joints
 
 
-def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
+def run_trial(rollout: Rollout, penetration: Penetration) -> TrialResult:
+    """Close the hands of a rollout and push the objects."""
     scene, rules = rollout.scene, rollout.scene.protocol
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)
@@ -109,7 +111,7 @@ def _repeated(
                 continue
             index, own = rows.repeat(end - begin), conditions.rows(slice((begin - 1) * len(rows), (end - 1) * len(rows)))
             rollout = Rollout(_scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own)
-            trials.append(_run(rollout, penetration.rows(index.numpy())))
+            trials.append(run_trial(rollout, penetration.rows(index.numpy())))
         results.append(verdict(TrialResult.join(trials, first.protocol), rules.trials, rules.needed))
     return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
 
@@ -134,13 +136,22 @@ def settle(
     scene = scene_of(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
     for part, rollout in rollouts(scene, hand, grasps, workers):
-        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
-        touching = contact_mask(hand, find_contact_links(scene, rollout.qpos))
-        holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
-        joints.append(torch.where(holding, reached, part.joints))
+        held_joints, T_object_wrist = held(part, rollout, torch.from_numpy(rollout.close().stable))
+        joints.append(held_joints)
         poses.append(T_object_wrist)
-    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
+    unsettled = grasps.without(*PER_JOINT, *CARRYING, "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def held(
+    part: GraspBatch, rollout: Rollout, sound: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
+    """Labels of closed hands, as of `settle`: joints and wrist poses; those of the grasp where the closing is not sound."""
+    hand = rollout.scene.hand
+    reached, T_object_wrist = _reached(part, rollout, hand, sound)
+    touching = contact_mask(hand, find_contact_links(rollout.scene, rollout.qpos))
+    holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
+    return torch.where(holding, reached, part.joints), T_object_wrist
 
 
 def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tensor, " n"]:

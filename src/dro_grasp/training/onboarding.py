@@ -33,7 +33,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.stages import evaluate
-from dro_grasp.simulation.protocols import PROTOCOLS, protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import load_bundle, split_of
 from dro_grasp.training.data.collections.bundling import make_bundle
@@ -49,7 +49,7 @@ WEIGHTS = "weights.safetensors"  # File of the fine-tuned weights
 REPORT = "report.html"  # File of the report
 DATA = "data"  # Folder of synthesized grasps
 PICTURE = "hand.png"  # File of the hand's picture
-STRICT = PROTOCOLS["strict"].label  # Protocol by which fine-tuning is judged
+JUDGE = PROTOCOLS[DEFAULT_PROTOCOL].label  # Protocol by which fine-tuning is judged
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Onboarded:
 
         The 95 % interval of the difference has to be above 0: of weights that are no better, one in forty passes for better.
         """
-        return difference_interval(*self.count("before", REFINED, STRICT), *self.count("after", REFINED, STRICT))[0] > 0
+        return difference_interval(*self.count("before", REFINED, JUDGE), *self.count("after", REFINED, JUDGE))[0] > 0
 
     @property
     def weights(self) -> str | None:
@@ -124,7 +124,7 @@ class Onboarded:
 
     def verdict(self) -> list[str]:
         """In words: whether fine-tuning gained anything, which objects are without grasps, and what to try."""
-        (held, asked), (held_after, asked_after) = (self.count(step, REFINED, STRICT) for step in ("before", "after"))
+        (held, asked), (held_after, asked_after) = (self.count(step, REFINED, JUDGE) for step in ("before", "after"))
         lines = []
         if not self.gained:
             low, high = difference_interval(held, asked, held_after, asked_after)
@@ -132,7 +132,7 @@ class Onboarded:
             if held_after > held:
                 better += "; to tell a small gain from chance, more --num"
             lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under "
-                         f"{STRICT} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
+                         f"{JUDGE} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
                          f"95 %). Keep the weights from before. {better}.")
         if self.without_grasps:
             lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
@@ -251,7 +251,7 @@ class _Onboarding:
     def _benchmark(self, weights: str | None) -> dict[str, Any]:
         """Success rates on held-out objects: of the network, and of the grasps that `generate` returns."""
         predictor = GraspPredictor(weights, self.config.device, self.config.predictor)
-        rules = tuple(protocol(name) for name in ("dro", "strict"))
+        rules = tuple(protocol(name) for name in ("dro", "strict", DEFAULT_PROTOCOL))
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
@@ -319,13 +319,13 @@ def write_report(done: Onboarded) -> Path:
 
 
 def _summary(done: Onboarded) -> str:
-    before, after = (done.rate(step, REFINED, STRICT) for step in ("before", "after"))
-    best = done.rate("after", BEST, STRICT)
+    before, after = (done.rate(step, REFINED, JUDGE) for step in ("before", "after"))
+    best = done.rate("after", BEST, JUDGE)
     returned = " and ".join(
-        f"{done.rate(step, RETURNED, STRICT):.0%} {step} ({done.optimised(step):.0%} of them made by the optimiser)"
+        f"{done.rate(step, RETURNED, JUDGE):.0%} {step} ({done.optimised(step):.0%} of them made by the optimiser)"
         for step in ("before", "after"))
     minutes = sum(step["seconds"] for step in done.steps.values()) / 60
-    return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>strict</i> before fine-tuning, and "
+    return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>carry</i> before fine-tuning, and "
             f"{after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of this hand; of the best quarter "
             f"by score, {best:.0%} pass. Of the grasps that <i>generate</i> returns, {returned} pass. All steps took "
             f"{minutes:.0f} minutes.</p>" + "".join(f"<p><b>{html.escape(line)}</b></p>" for line in done.verdict()))
@@ -336,17 +336,18 @@ def _rates(done: Onboarded) -> str:
     for step in ("before", "after"):
         for row in done.steps[step]["rows"]:
             rates = [f"{100 * p:.0f} % [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row["success"].values()]
-            touching, all_touch = (100 * share for share in row["fingers"][STRICT])
+            touching, all_touch = (100 * share for share in row["fingers"][JUDGE])
             rows.append([step, STAGES[row["stage"]], row["asked"], row["returned"], *rates, f"{touching:.0f} ({all_touch:.0f})",
                          f"{100 * row['optimised']:.0f} %", f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
     return table(["weights", "grasps", "asked", "returned", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
         "<p class=note>Success rates of the grasps asked for, with 95 % intervals. dro is the paper's protocol and lenient; "
-        "strict also limits penetration and how far closing may push the object. Fingers: the share of the hand's that touch "
-        "the object, and in parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
-        "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
-        "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
-        "is. <i>generate --source network</i> does without.</p>")
+        "strict also limits penetration and how far closing may push the object; carry pulls with the object's weight, and "
+        "fingers are as strong as they are. Fingers: the share of the hand's that touch the object, and in parentheses of "
+        "the grasps with all of them. The network's rows are what fine-tuning improves. <i>generate</i> keeps the best of "
+        "four of the network's candidates by score, as the row <i>best quarter</i> does, and asks the optimiser for others "
+        "where the score does not trust these: slower, and less needed the better the network is. <i>generate --source "
+        "network</i> does without.</p>")
 
 
 def _drawn(done: Onboarded) -> str:
@@ -358,7 +359,7 @@ def _drawn(done: Onboarded) -> str:
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
         made = predictor.run(problem, GraspRequest(asked, source=config.source))
-        draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
+        draw_grasps(hand, obj, evaluate(problem, made.grasps), path)
         by_optimiser, short = made.origin.count("optimiser"), ""
         if len(made.grasps) < asked:
             short = f"; {len(made.grasps)} of the {asked} asked for were found"
@@ -380,7 +381,7 @@ def _commands(done: Onboarded) -> str:
     lines = [
         command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights, *source)
         + " --output grasps.parquet",
-        "dro-grasp evaluate grasps.parquet --protocol strict",
+        "dro-grasp evaluate grasps.parquet --protocol robust",
         "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",
         command("dro-grasp", "dataset", "report", done.folder / DATA, "--output", "data.html"),
     ]

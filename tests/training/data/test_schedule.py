@@ -26,7 +26,7 @@ from tests.helpers.here_pool import HerePool, run
 from tests.helpers.loaded_hands import loaded_hand
 
 TINY = EngineConfig(
-    candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
+    "strict", candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
 SMALL = replace(TINY, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32))
 
 
@@ -220,7 +220,7 @@ def test_a_success_that_hardly_anything_touches_is_not_kept():
 def test_idle_fingers_of_new_grasps_close():
     """The same candidates; closing changes which are near-duplicates, so the wrist tells which grasp is which."""
     hand, can = loaded_hand("allegro"), load_object("can")
-    config = EngineConfig(candidates=48, synthesis=SynthesisConfig(steps=60, batch_size=48))
+    config = EngineConfig("strict", candidates=48, synthesis=SynthesisConfig(steps=60, batch_size=48))
     left, closed = (valid_grasps(hand, can, 2, replace(config, close_fingers=close))[0] for close in (False, True))
     assert "relabelled" not in left.extra
     marked = closed.extra["relabelled"]
@@ -240,7 +240,7 @@ def test_settled_labels_move_only_joints_that_hold(tmp_path):
 
     hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(
-        candidates=48, trial_share=0.5, settle=False, close_fingers=False,
+        "strict", candidates=48, trial_share=0.5, settle=False, close_fingers=False,
         synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
     settled = settle(hand, can, grasps, "strict")
     held = simulate(hand, can, grasps, "strict").contact_links

@@ -16,7 +16,7 @@ from tests.helpers.here_pool import run
 
 
 @pytest.mark.parametrize(("options", "told"), [
-    ({"config": EngineConfig("dro", scale=0.5)}, r"with protocol strict, scale 1\.0, protocol dro, scale 0\.5 was asked for"),
+    ({"config": EngineConfig("dro", scale=0.5)}, r"with protocol carry, scale 1\.0, protocol dro, scale 0\.5 was asked for"),
     ({"seed": 3}, "begun with seed 0, seed 3 was asked for; use the same to go on, or name another folder"),
     ({"config": EngineConfig(synthesis=SynthesisConfig(steps=9))}, r"synthesis\.steps 120, synthesis\.steps 9 was asked for"),
     ({"config": EngineConfig(synthesis=SynthesisConfig(contacts=ContactConfig(level_weights=(1.0,))))}, "level_weights"),

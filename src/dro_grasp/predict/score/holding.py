@@ -23,7 +23,8 @@ MOST_MOTION = 0.1  # Motions of an object above this look alike: it is lost [m] 
 LEAST_TURN = 1e-3  # Turns under the weight below this look alike [rad] (ours)
 LEAST_MASS = 1e-3  # Masses below this look alike [kg] (ours)
 DEEP = 0.01  # Depths above this look alike [m] (ours)
-FEATURES = 20  # Numbers of each grasp that the model sees; see `holding_features`
+LEAST_SHARE = 0.05  # Payloads that are a smaller share of the mass look alike, and those that are as large a multiple (ours)
+FEATURES = 21  # Numbers of each grasp that the model sees; see `holding_features`
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,15 @@ class Evidence(Rows):
     stable: Bool[Tensor, " n"]
     """Whether the grasp settled: it holds still, and no link is too deep."""
     depth: Float[Tensor, " n"]
-    """Deepest penetration before the second closing [m]."""
+    """Deepest penetration before the last closing [m]."""
     effort: Float[Tensor, " n"]
     """Largest share of its effort with which a joint squeezes."""
     mass: Float[Tensor, " n"]
     """The object's mass [kg]."""
+    payload: Float[Tensor, " n"]
+    """Predicted payload [kg]."""
     state: GraspState
-    """How the object is held after the second closing."""
+    """How the object is held after the last closing."""
 
     def rows(self, index: Int[Tensor, " k"] | Bool[Tensor, " n"]) -> Evidence:
         """Some of the rows."""
@@ -54,19 +57,21 @@ class Evidence(Rows):
         unknown = torch.full((n,), torch.nan)
         pair = torch.full((n, 2), torch.nan)
         state = GraspState(**{f.name: unknown for f in fields(GraspState)} | {"unanswered": pair, "gave": pair})
-        return Evidence(unknown, torch.zeros(n, dtype=torch.bool), unknown, unknown, torch.full((n,), mass), state)
+        return Evidence(unknown, torch.zeros(n, dtype=torch.bool), unknown, unknown, torch.full((n,), mass), unknown, state)
 
     def known(
-        self, rows: Int[Tensor, " k"], depth: Float[Tensor, " k"], effort: Float[Tensor, " k"], state: GraspState
+        self, rows: Int[Tensor, " k"], depth: Float[Tensor, " k"], effort: Float[Tensor, " k"], payload: Float[Tensor, " k"],
+        state: GraspState,
     ) -> Evidence:
-        """The same with what the second closing showed of some rows."""
+        """The same with what the last closing showed of some rows."""
         def put(old: Float[Tensor, "n *rest"], new: Float[Tensor, "k *rest"]) -> Float[Tensor, "n *rest"]:
             found = old.clone()
             found[rows] = new.to(old)
             return found
 
         filled = GraspState(**{f.name: put(getattr(self.state, f.name), getattr(state, f.name)) for f in fields(GraspState)})
-        return replace(self, depth=put(self.depth, depth), effort=put(self.effort, effort), state=filled)
+        return replace(self, depth=put(self.depth, depth), effort=put(self.effort, effort), payload=put(self.payload, payload),
+                       state=filled)
 
 
 def holding_features(score: Float[Tensor, " n"], known: Evidence) -> Float[Tensor, "n features"]:
@@ -77,10 +82,10 @@ def holding_features(score: Float[Tensor, " n"], known: Evidence) -> Float[Tenso
     amounts = torch.stack([state.contacts, state.links, state.pressure, known.effort], 1).log1p()
     moved = known.moved.clamp(LEAST_MOTION, MOST_MOTION).log()
     flags = torch.stack([known.stable, known.moved.isfinite(), state.shift.isfinite()], 1).to(score)
-    single = torch.stack([score, moved, known.depth.clamp(0, DEEP) / DEEP, known.mass.clamp_min(LEAST_MASS).log(),
+    share = (known.payload / known.mass).clamp(LEAST_SHARE, 1 / LEAST_SHARE).log()
+    single = torch.stack([share, score, moved, known.depth.clamp(0, DEEP) / DEEP, known.mass.clamp_min(LEAST_MASS).log(),
                           state.slip.clamp_max(2)], 1)
     return torch.cat([single, motion, amounts, state.unanswered, gave, flags], 1)
-
 
 
 class HoldingScore(nn.Module):

@@ -13,7 +13,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import TrialResult
-from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import PairGrasps, Sources
@@ -48,6 +48,19 @@ class Agreement:
             succeeded=self.succeeded + success, reasons=self.reasons + failed,
             hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
         )
+
+
+def stored_protocol(pairs: Iterable[PairGrasps]) -> str:
+    """Name of the protocol whose outcomes a data set states; the usual one where it states none.
+
+    Raises:
+        OptionError: It states several, or one of which nothing is known but its label.
+    """
+    labels = sorted({label for pair in pairs for label in pair.grasps.protocol if label})
+    known = {rules.label: name for name, rules in PROTOCOLS.items()}
+    if len(labels) > 1 or not set(labels) <= set(known):
+        raise OptionError(f"the data set states outcomes under {', '.join(labels)}; say which protocol to check: --protocol")
+    return known[labels[0]] if labels else DEFAULT_PROTOCOL
 
 
 def check(

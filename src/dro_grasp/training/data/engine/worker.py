@@ -24,7 +24,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.fingers import close_idle_fingers
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from dro_grasp.training.data.bundle.training_file import split_of
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
@@ -36,7 +36,7 @@ LOOSE = "held by too few links"  # Reason that counts grasps which pass the tria
 class EngineConfig(Checked):
     """Settings of a data set's production."""
 
-    protocol: str = "strict"
+    protocol: str = DEFAULT_PROTOCOL
     """Trial that grasps must pass."""
     scale: float = 1.0
     """Multiplies the coordinates of all objects."""
