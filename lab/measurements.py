@@ -86,6 +86,12 @@ def _unseen() -> dict[str, str]:
     return cells
 
 
+def _confidence() -> dict[str, str]:
+    groups = {_short(hand): f"--hands {hand}" for hand in (*PAPER_HANDS, *UNSEEN_HANDS)} | {"made": f"--made {MADE_HANDS}"}
+    return {f"{group}, {name}": f"python -m lab.studies.confidence {hands} --objects {objects} --num 8 --json"
+            for group, hands in groups.items() for name, objects in (("test", OBJECTS["test"]), ("hard", "builtin:hard_test"))}
+
+
 MEASUREMENTS = {
     "headline": Measurement(
         "The paper's hands on objects that no weights were trained on, with controls of equal time", _headline()),
@@ -106,6 +112,8 @@ MEASUREMENTS = {
         name: _benchmark("auto", shlex.quote(f"{PREPARED}/published/{path}"), HARD,
                          f"--num 32 --stages returned --protocols {ALL}")
         for name, path in PUBLISHED.items()}),
+    "confidence": Measurement(
+        "Whether confidence is how often grasps hold, on hands and objects that no weights were trained on", _confidence()),
     "views": Measurement("The paper's hands on objects seen in part", {
         f"{view}, {_short(hand)}": _benchmark(
             "auto", hand, OBJECTS["validate"], f"--view {view} --num 16 --stages returned --protocols {FAST}")

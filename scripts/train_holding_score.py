@@ -43,7 +43,7 @@ from dro_grasp.training.made_hands.making import make_hand
 
 TRIALS = ("carry", "robust")
 """Protocols whose outcome the model predicts."""
-COSTLY = 0.2
+COSTLY = 0.15
 """Share of the pairs of hand and object whose grasps get the second kind of trial, too, which takes eight times as long."""
 FIRST_MADE = 20_000
 """Seed of the first made-up hand; the ranking network has seen others."""
@@ -159,6 +159,7 @@ class Rows:
     """Grasps of many pairs, in rows."""
 
     features: torch.Tensor
+    score: torch.Tensor  # of the ranking network
     outcomes: torch.Tensor  # NaN where not tried
     hand: list[str]
     pair: torch.Tensor  # number of the pair of hand and object
@@ -167,18 +168,19 @@ class Rows:
     @staticmethod
     def read(folder: Path) -> Rows:
         """All grasps of a folder."""
-        features, outcomes, hand, pair, settled = [], [], [], [], []
+        features, score, outcomes, hand, pair, settled = [], [], [], [], [], []
         for number, path in enumerate(sorted(folder.glob("*.pt"))):
             for part in torch.load(path, weights_only=True):
                 state = GraspState(**part["state"])
                 known = Evidence(**{f.name: part[f.name] for f in fields(Evidence) if f.name != "state"}, state=state)
                 n = len(part["score"])
                 features.append(holding_features(part["score"], known))
-                outcomes.append(part["outcomes"][:, [0, -1]])
+                score.append(part["score"])
+                outcomes.append(part["outcomes"])
                 hand += [part["hand"]] * n
                 pair += [number] * n
                 settled += [not part["maker"].endswith("unsettled")] * n
-        return Rows(torch.cat(features), torch.cat(outcomes), hand, torch.tensor(pair), torch.tensor(settled))
+        return Rows(torch.cat(features), torch.cat(score), torch.cat(outcomes), hand, torch.tensor(pair), torch.tensor(settled))
 
     def of(self, hands: set[str], inside: bool = True) -> torch.Tensor:
         """Which rows are of these hands, or of others."""
@@ -268,7 +270,7 @@ def judged(rows: Rows, seed: int) -> dict[str, Any]:
         tried = column.isfinite() & rows.settled
         found[name] = {
             "area": roc_area(odds[tried], column[tried] > 0.5),
-            "area_before": roc_area(rows.features[tried, 0], column[tried] > 0.5),
+            "area_before": roc_area(rows.score[tried], column[tried] > 0.5),
             "returned": float(column[tried & chosen].mean()), "of": int((tried & chosen).sum())}
     found["bins"] = reliability(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5)
     found["least"] = [price_of_least(odds[chosen].sigmoid(), rows.outcomes[chosen, 0] > 0.5, least) for least in LEVELS]

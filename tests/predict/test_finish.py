@@ -74,7 +74,7 @@ def naive(problem: GraspProblem, made: Candidates, keep: int) -> tuple[GraspBatc
 @pytest.mark.parametrize("problem", [WHOLE, ON_TABLE], ids=["free", "on a table"])
 def test_the_chain_is_its_stages_one_after_the_other(problem: GraspProblem) -> None:
     made = candidates(problem)
-    done = finish(problem, made, keep=3)
+    done = finish(problem, made, FinishConfig(least_confidence=0.1), keep=3)
     expected, rows, passed = naive(problem, made, 3)
     same(done.grasps, expected)
     assert done.proposed.origin == tuple(f"start 0.{row}" for row in rows)

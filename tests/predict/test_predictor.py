@@ -25,6 +25,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.network import ProposalConfig, _placements
@@ -104,7 +105,8 @@ def test_grasps_are_complete_valid_and_sorted(
 ) -> None:
     assert len(grasps) == 7
     assert grasps.score.tolist() == sorted(grasps.score.tolist(), reverse=True)
-    torch.testing.assert_close(grasps.score, scored(GraspProblem(HAND, ball), grasps).score, atol=1e-4, rtol=1e-4)
+    expected = holding_score(scored(GraspProblem(HAND, ball), grasps).score, Evidence.none(7, ball.mass))
+    torch.testing.assert_close(grasps.score, expected, atol=1e-4, rtol=1e-4)
     for joints in (grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints):
         assert bool(((joints >= HAND.tree.lower - 1e-5) & (joints <= HAND.tree.upper + 1e-5)).all())
     rotation = grasps.T_object_wrist[:, :3, :3]

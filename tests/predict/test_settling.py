@@ -17,6 +17,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
@@ -35,9 +36,9 @@ from dro_grasp.predict.settling import (
     settle_best,
     settle_grasps,
 )
-from dro_grasp.predict.stages import evaluate, refine, scored
+from dro_grasp.predict.stages import evaluate, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import WeightConfig
+from dro_grasp.simulation.grasp_state import press
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from tests.helpers.loaded_hands import loaded_hand
@@ -69,7 +70,7 @@ def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
     return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
 
 
-def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: GraspBatch) -> None:
+def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: GraspBatch, outcome: Settled) -> None:
     """Simulated: a grasp of the can that leaves it where it is, one that pushes it away a little, and those that lose it."""
     closed = settle(HAND, CAN, many, "strict")
     moved = hand_shift(HAND, many, closed)
@@ -78,11 +79,12 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
     assert min(int(rows.sum()) for rows in (still, pushed, lost)) > 0
     found, stable, known = outcome
     assert bool(stable[still].all()), "with this can they are not deep either"
-    torch.testing.assert_close(found.T_object_wrist[still], closed.T_object_wrist[still])
-    torch.testing.assert_close(found.joints[still], closed.joints[still])
+    pressed = press(HAND, CAN, grip(PROBLEM, closed[still], RefineConfig()), "strict")
+    for name in ("T_object_wrist", "joints", "squeeze_joints"):
+        torch.testing.assert_close(getattr(found, name)[still], getattr(pressed, name))
     assert (found.squeeze_joints[still] - many.squeeze_joints[still]).abs().amax(1).min() > 1e-4, "it squeezes anew"
     assert bool(stable[pushed].any())
-    again = refine(PROBLEM, closed[pushed & stable])
+    again = press(HAND, CAN, refine(PROBLEM, closed[pushed & stable]), "strict")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
         torch.testing.assert_close(getattr(found, name)[pushed & stable], getattr(again, name))
         assert torch.equal(getattr(found, name)[~stable], getattr(many, name)[~stable]), "as it was"
@@ -150,8 +152,7 @@ def test_only_the_better_share_is_settled_and_what_is_not_held_counts_as_unstabl
     outcome = settle_grasps(PROBLEM, known[rows], never)
     expected = holding_score(scored(PROBLEM, known[rows]).score, outcome.known)
     torch.testing.assert_close(found.score, expected)
-    usual = settle_best(PROBLEM, known, 1)
-    assert bool((found.score < usual.grasps.score).all())
+    assert not outcome.stable.any()
     assert set(doubts) <= {AWAY, DEEP}
     assert DEEP in doubts
     for share, least, count in ((0.5, 4, 4), (0.5, 9, 5), (0.2, 0, 1), (1.0, 0, 5)):
@@ -175,15 +176,11 @@ def test_doubts_say_what_closing_showed(outcome: Settled) -> None:
     assert [held[i] for i in rows] == [""] * 3
 
 
-def test_effort_is_that_of_the_joint_that_is_nearest_to_its_limit(many: GraspBatch) -> None:
-    pressed = many[:1].replace(squeeze_joints=many[:1].joints.clone())
-    assert float(effort_share(HAND, pressed, SettleConfig())) == 0
-    joint = int(HAND.movable.nonzero()[0])
-    squeeze = pressed.joints.clone()
-    squeeze[0, joint] += 0.1
-    limit, unit = find_efforts(HAND).limit[joint], HAND.tree.joint_unit[joint]
-    found = float(effort_share(HAND, pressed.replace(squeeze_joints=squeeze), SettleConfig()))
-    assert found == pytest.approx(float(3.0 * 0.1 / unit**2 / limit), rel=1e-5)
+def test_effort_is_that_of_the_joint_that_is_nearest_to_its_limit() -> None:
+    limit = find_efforts(HAND).limit
+    torque = torch.stack([torch.zeros_like(limit), 0.1 * limit, -0.1 * limit])
+    torque[2, int(HAND.movable.nonzero()[-1])] *= -5
+    torch.testing.assert_close(effort_share(HAND, torque), torch.tensor([0.0, 0.1, 0.5]))
 
 
 def test_what_ends_where_constraints_forbid_stays_as_it_was_and_scores_low(many: GraspBatch, outcome: Settled) -> None:
@@ -227,10 +224,10 @@ def test_on_a_bare_cloud_grasps_settle_where_they_do_on_the_mesh_and_get_no_tria
     sphere = load_object("sphere")
     whole, bare = GraspProblem(HAND, sphere), GraspProblem(HAND, partial_view(sphere, "cloud", 0))
     some = refine(whole, synthesize(HAND, sphere, 16, 2, SynthesisConfig(batch_size=16, steps=20)))
-    on_mesh, on_balls = settle_grasps(whole, some), settle_grasps(bare, some)
+    on_mesh, on_balls = settle_grasps(whole, some, FIRM), settle_grasps(bare, some, FIRM)
     both = on_mesh.stable & on_balls.stable
     assert both.sum() > 3
-    assert hand_shift(HAND, on_mesh.grasps[both], on_balls.grasps[both]).median() < 0.002
+    assert hand_shift(HAND, on_mesh.grasps[both], on_balls.grasps[both]).median() < 0.003
     turned = [made.grasps.T_object_wrist[both, :3, :3] for made in (on_mesh, on_balls)]
     assert roma.rotmat_geodesic_distance(*turned).median() < 0.1
     gap = [p.field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(1) for p, (g, _, _) in (

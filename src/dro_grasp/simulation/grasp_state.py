@@ -1,4 +1,4 @@
-"""What holds the object once the hand has closed: the motion that is left, the contacts, and what the weight then does. Ours."""
+"""What holds the object once the hand has closed: motion that is left, contacts, and what the weight then does. Ours."""
 
 from __future__ import annotations
 
