@@ -71,6 +71,12 @@ class GraspBatch:
     """Predicted log-odds that the grasp holds; higher is better."""
     energy: Float[Tensor, " n"]
     """Grasp energy; lower is better."""
+    payload: Float[Tensor, " n"]
+    """Largest mass that the grasp is predicted to hold whichever way gravity pulls, where it squeezes for it [kg]."""
+    squeeze_force: Float[Tensor, " n"]
+    """Sum of the normal forces on the object at the squeeze [N]."""
+    squeeze_torque: Float[Tensor, "n n_dof"]
+    """Torques of the joints at the squeeze [Nm, N where they slide]; a row of NaN is unknown."""
     trial_success: Bool[Tensor, " n"]
     """What `success` returns; False for all while no grasp has been evaluated."""
     displacement: Float[Tensor, " n"]

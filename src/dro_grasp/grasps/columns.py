@@ -18,12 +18,14 @@ from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
 """Columns of one number per grasp that a trial fills; NaN is unknown."""
-FLOATS = ("score", "energy", *TRIAL_FLOATS)  # All columns of one number per grasp
+CARRYING = ("payload", "squeeze_force")  # Columns of one number per grasp that closing in simulation fills; NaN is unknown
+FLOATS = ("score", "energy", *TRIAL_FLOATS, *CARRYING)  # All columns of one number per grasp
 POSTURES = ("pregrasp_joints", "squeeze_joints")  # Columns of one number per joint; a row of NaN is not stated
+PER_JOINT = (*POSTURES, "squeeze_torque")  # The same, with the torques
 TEXTS = ("object", "object_sha256", "split", "provenance")  # Columns of one string per grasp; the empty string is unknown
-COLUMNS = ("T_object_wrist", "joints", "seed", "trial_success", "protocol", *FLOATS, *POSTURES, *TEXTS)
+COLUMNS = ("T_object_wrist", "joints", "seed", "trial_success", "protocol", *FLOATS, *PER_JOINT, *TEXTS)
 """Fields of a batch with one entry per grasp."""
-MAY_BE_UNKNOWN = ("score", "energy", *POSTURES)
+MAY_BE_UNKNOWN = ("score", "energy", *CARRYING, *PER_JOINT)
 """Columns that say nothing about a grasp until somebody fills them; those of its trial are the others."""
 NOT_EVALUATED = ""  # Protocol of a grasp without a trial
 UNKNOWN_PROTOCOL = "unknown"  # Protocol of a grasp whose outcome is known without its protocol
@@ -238,7 +240,7 @@ def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:
     n = len(joints)
     if name in FLOATS:
         return torch.full((n,), torch.nan, device=joints.device)
-    if name in POSTURES:
+    if name in PER_JOINT:
         return torch.full_like(joints, torch.nan)
     if name in {"seed", "trial_success"}:
         return torch.zeros(n, dtype=torch.int64 if name == "seed" else torch.bool, device=joints.device)

@@ -53,7 +53,7 @@ KINDS: tuple[tuple[str, Callable[[pa.DataType], bool], tuple[str, ...]], ...] = 
     ("whole numbers", pa.types.is_integer, ("seed",)),
     ("truth values", pa.types.is_boolean, ("success",)),
     ("lists of numbers", _is_list_of(_is_number),
-     ("joints", "wrist_position", "wrist_quaternion_wxyz", *columns.POSTURES, CAMERA)),
+     ("joints", "wrist_position", "wrist_quaternion_wxyz", *columns.PER_JOINT, CAMERA)),
     ("lists of texts", _is_list_of(_is_text), (columns.CONTACT_LINKS,)),
 )
 """What columns hold, in words and as a test of their type, and which columns do; all may be null."""
@@ -219,7 +219,7 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
         "wrist_quaternion_wxyz": fixed_column(batch.wrist_quaternion_wxyz),
         "joints": float_column(batch.joints),
     }
-    stored |= {name: float_column(getattr(batch, name)) for name in (*columns.POSTURES, *columns.FLOATS)}
+    stored |= {name: float_column(getattr(batch, name)) for name in (*columns.PER_JOINT, *columns.FLOATS)}
     stored["success"] = pa.array(batch.trial_success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
     stored["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
     for name in columns.TEXTS[1:]:
@@ -262,7 +262,7 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     protocol = tuple(columns.NOT_EVALUATED if s is None else p or columns.UNKNOWN_PROTOCOL
                      for p, s in zip(text("protocol"), success, strict=True))
     fields: dict[str, Any] = {name: text(name) for name in columns.TEXTS}
-    fields |= {name: numbers(name, n_dof) for name in columns.POSTURES} | {name: numbers(name, None) for name in columns.FLOATS}
+    fields |= {name: numbers(name, n_dof) for name in columns.PER_JOINT} | {name: numbers(name, None) for name in columns.FLOATS}
     if "energy" not in table.column_names:
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
     known = {*columns.COLUMNS, *REQUIRED, "success"}
