@@ -69,6 +69,8 @@ class Plan:
     """Plan file: arm and hand over time, by stage, and what was dropped."""
     trajectory: Annotated[Path | None, optional("YAML", "not written")] = None
     """The motion as trajectory_msgs/JointTrajectory, one for the arm and one for the hand."""
+    efforts: Flag = False
+    """Write efforts into the hand's points of --trajectory, for controllers with an effort interface; others refuse them."""
     csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
     json: Flag = False  # Print one JSON object instead of text.
 
@@ -97,6 +99,8 @@ class Plan:
         for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
             if path is not None:
                 check_output(path, ending)
+        if self.efforts and self.trajectory is None:
+            raise OptionError("--efforts are written into the trajectory file; name one with --trajectory YAML")
         robot = load_robot(self.robot)
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
@@ -113,10 +117,14 @@ class Plan:
         made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
         if self.output is not None:
             made.save(self.output)
-        for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
-            if path is not None:
-                with replacing(path, "trajectory") as temporary:
-                    temporary.write_text(text(made), encoding="utf-8")
+        if self.efforts and made.notes.squeeze_torque is None:
+            say_aside("warning: the efforts of the grasp are unknown, so the hand's points have none; close with a low limit")
+        if self.trajectory is not None:
+            with replacing(self.trajectory, "trajectory") as temporary:
+                temporary.write_text(trajectory_yaml(made, self.efforts), encoding="utf-8")
+        if self.csv is not None:
+            with replacing(self.csv, "trajectory") as temporary:
+                temporary.write_text(trajectory_csv(made), encoding="utf-8")
         written = {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
