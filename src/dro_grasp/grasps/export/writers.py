@@ -117,7 +117,7 @@ def comment(grasps: GraspBatch, frame: Frame) -> str:
 
 def forces(grasps: GraspBatch, i: int) -> dict[str, float]:
     """Payload [kg] and squeeze force [N] of a grasp, as far as they are known."""
-    return {name: plain(column[i:i + 1])[0] for name in columns.FORCES
+    return {name: plain(column[i:i + 1])[0] for name in columns.CARRYING
             if bool((column := getattr(grasps, name))[i].isfinite())}
 
 
@@ -268,12 +268,12 @@ def csv_table(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str
     writer = csv.writer(text, lineterminator="\n")
     names = [f"{posture}:{joint}" for posture in (*joints, "effort") for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
-                     "robustness", "fingers_in_contact", *columns.FORCES, *names])
+                     "robustness", "fingers_in_contact", *columns.CARRYING, *names])
     for i in range(len(grasps)):
         writer.writerow([
             grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _cell(grasps.score[i]), _cell(grasps.energy[i]),
             int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
-            *(_cell(getattr(grasps, name)[i]) for name in ("robustness", "fingers_in_contact", *columns.FORCES)),
+            *(_cell(getattr(grasps, name)[i]) for name in ("robustness", "fingers_in_contact", *columns.CARRYING)),
             *(value for values in joints.values() for value in plain(values[i])), *map(_cell, efforts[i]),
         ])
     return text.getvalue()
