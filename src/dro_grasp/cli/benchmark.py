@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dro_grasp.objects.shape import ObjectModel
 
 QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
-"""What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
+"""What --quick measures: of 16 candidates a pair, methods return a quarter (ours)."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Benchmark:
                 "rows": [row.to_dict() for row in rows],
             })
             return 0
-        title = f"{self.num} grasps of each hand on each of {len(objects)} objects"
+        title = f"{self.num} candidates of each hand on each of {len(objects)} objects"
         if self.weights is not None:
             title = f"weights '{self.weights}', {title}"
         if self.view != "whole":
