@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
@@ -62,6 +62,9 @@ class Benchmark:
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What methods, refinement and ranking see: the mesh (whole), its points (cloud), half of them as in the paper (half), or
     a depth image (depth)."""
+    mass: Mass = None  # Mass of every object [kg].
+    margin: Annotated[float | None, optional("TIMES", "1.5")] = None  # Multiple of the weight that squeezes hold.
+    max_force: Annotated[float | None, optional("N", "any")] = None  # Largest normal force of a contact at the squeeze [N].
     views: int = 1  # Views of each object for each hand, with --num grasps each.
     seed: int = 0  # The same seed gives the same grasps and views.
     json: Flag = False  # Print one JSON object instead of a Markdown table.
@@ -73,6 +76,7 @@ class Benchmark:
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predict.config import GraspRequest
+        from dro_grasp.predict.constraints import Constraints
         from dro_grasp.simulation.protocols import protocol
 
         if self.quick:
@@ -93,7 +97,8 @@ class Benchmark:
         stages = tuple(name for stage in self.stages for name in (stage, *further.get(stage, ())))
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), seed=self.seed, view=self.view,
-            views=self.views, device=self.device, contact_quality=self.contact_quality,
+            views=self.views, device=self.device, contact_quality=self.contact_quality, mass=self.mass,
+            constraints=Constraints(margin=self.margin, max_force=self.max_force),
         )
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, methods, config, progress)

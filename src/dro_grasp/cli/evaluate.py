@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
@@ -39,6 +39,7 @@ class Evaluate:
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use instead of the one named in the file, for a file with one object."""
     scale: float = 1.0  # Scale of the mesh given with --object.
+    mass: Mass = None  # Mass of every object [kg].
     contact_quality: Flag = False
     """Also measure the analytic metrics of DexGraspBench, with the protocol's friction: penetration, contact distance and
     force closure of the grasps as they are, without any motion."""
@@ -83,6 +84,7 @@ class Evaluate:
         """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds."""
         from dro_grasp.errors import ObjectError
         from dro_grasp.grasps.sources import object_of
+        from dro_grasp.objects.shape import with_mass
         from dro_grasp.predict.problem import GraspProblem
         from dro_grasp.simulation.scene import require_simulable
 
@@ -91,6 +93,7 @@ class Evaluate:
         for name, part in grasps.by_object():
             obj = object_of(part, self.object, self.scale)
             compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)
+            obj = obj if self.mass is None else with_mass(obj, self.mass)
             try:
                 require_simulable(hand, obj)
             except ObjectError as error:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
@@ -58,6 +58,7 @@ class Generate:
     """Keep every point of a cloud. By default a table in it is found and cut off, and hands stay above it."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
+    mass: Mass = None  # Mass of the object [kg], which the grasps shall carry.
     scale: float = 1.0  # Multiplies the object's coordinates; 0.001 for files in millimetres.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
@@ -191,10 +192,12 @@ class Generate:
         from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.perception.scan import load_scan
+        from dro_grasp.objects.shape import with_mass
 
         if camera is None:
-            return load_object(name, scale=self.scale, keep_table=self.keep_table)
-        return load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
+            return load_object(name, scale=self.scale, keep_table=self.keep_table, mass=self.mass)
+        scan = load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
+        return scan if self.mass is None else with_mass(scan, self.mass)
 
     def _warning(self, job: Job, obj: ObjectModel) -> str | None:
         """What is odd about the table, in words; None for nothing."""

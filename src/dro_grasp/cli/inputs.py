@@ -18,6 +18,7 @@ else:
     ProtocolName = Literal[tuple(PROTOCOLS)]
 
 Ball = tuple[float, float, float, float]  # Centre and radius [m]
+Mass = Annotated[float | None, tyro.conf.arg(metavar="KG", help_behavior_hint="(default: density times volume)")]
 Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 
@@ -28,7 +29,7 @@ def optional(metavar: str, default: str) -> Any:
 
 @dataclass(frozen=True)
 class PalmOptions:
-    """Where palms point, and how far hands open."""
+    """Where palms point, how far hands open, and how hard they squeeze."""
 
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
     """Palm direction: 0 0 -1 grasps from above. Over a table, palms also tilt down as far as the hand needs room."""
@@ -36,6 +37,11 @@ class PalmOptions:
     """Largest angle [rad] between the palm direction and --direction. Palms are spread evenly within it."""
     pregrasp_clearance: Annotated[float | None, optional("M", "a quarter of what is left")] = None
     """Least distance [m] between the object and every link that closes, in pregrasp."""
+
+    margin: Annotated[float | None, optional("TIMES", "1.5")] = None
+    """Multiple of the object's weight that the squeeze holds, whichever way gravity pulls."""
+    max_force: Annotated[float | None, optional("N", "any")] = None
+    """Largest normal force [N] of a contact at the squeeze, for soft and fragile things."""
 
     def constraints(self, table: float | None = None, obstacles: Scene | None = None) -> Constraints:
         """These options, with a table's height [m] and what stands around."""
@@ -46,7 +52,7 @@ class PalmOptions:
 
 @dataclass(frozen=True)
 class ConstraintOptions(PalmOptions):
-    """Where palms point, how far hands open, and where they touch."""
+    """Where palms point, how far hands open, how hard they squeeze, and where they touch."""
 
     contact_region: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
     """Balls [m], four numbers each. In the grasp the hand touches the object only inside them."""

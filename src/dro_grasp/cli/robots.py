@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, PalmOptions, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class Plan:
     """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
     of it."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
+    mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
@@ -84,6 +85,7 @@ class Plan:
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
+        from dro_grasp.objects.shape import with_mass
         from dro_grasp.predict.predictor import GraspPredictor
 
         require_extra("arm")
@@ -105,6 +107,8 @@ class Plan:
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
+        if self.mass is not None:
+            obj = with_mass(obj, self.mass)
         if robot.table is None:
             say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
                       "`table` in the robot file")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -20,7 +20,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.partial_views import View, partial_view
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, with_mass
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import can_settle
@@ -62,6 +63,8 @@ class BenchmarkConfig(Checked):
     seed: int = 0  # Of all grasps and views; each pair's seeds are derived from it
     workers: int | None = None  # Threads of the trials; all cores by default
     device: str = "cpu"  # Where the grasp energy is computed
+    mass: float | None = None  # Mass of every object [kg]; its own by default
+    constraints: Constraints = field(default_factory=Constraints)  # What grasps have to respect
     contact_quality: bool = False  # Whether contacts are measured too, as DexGraspBench does
 
 
@@ -81,15 +84,18 @@ def benchmark(
         raise OptionError(f"two methods are called '{twice[0]}' and would share rows; give one of them another name")
     table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
     done, pairs = 0, len(hands) * len(objects)
+    objects = [obj if config.mass is None else with_mass(obj, config.mass) for obj in objects]
     for hand in hands:
         found: dict[tuple[str, str], list[EvaluatedGrasps]] = {}
         for obj in objects:
             known = [method for method in methods if method.knows(hand)]
-            whole = GraspProblem(hand, obj, config.device)
+            whole = GraspProblem(hand, obj, config.device, config.constraints)
             for seed in view_seeds(config, hand, obj):
                 problem = whole
                 if config.view != "whole":
-                    problem = GraspProblem(hand, partial_view(obj, config.view, seed), config.device)
+                    seen = partial_view(obj, config.view, seed)
+                    seen = seen if config.mass is None else with_mass(seen, config.mass)
+                    problem = GraspProblem(hand, seen, config.device, config.constraints)
                 for name, stage, evaluated in _measured(problem, obj, known, config, seed):
                     found.setdefault((name, stage), []).append(evaluated)
             done += 1

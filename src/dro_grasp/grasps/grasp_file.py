@@ -262,7 +262,8 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     protocol = tuple(columns.NOT_EVALUATED if s is None else p or columns.UNKNOWN_PROTOCOL
                      for p, s in zip(text("protocol"), success, strict=True))
     fields: dict[str, Any] = {name: text(name) for name in columns.TEXTS}
-    fields |= {name: numbers(name, n_dof) for name in columns.PER_JOINT} | {name: numbers(name, None) for name in columns.FLOATS}
+    fields |= {name: numbers(name, n_dof) for name in columns.PER_JOINT}
+    fields |= {name: numbers(name, None) for name in columns.FLOATS}
     if "energy" not in table.column_names:
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
     known = {*columns.COLUMNS, *REQUIRED, "success"}

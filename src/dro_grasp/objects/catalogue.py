@@ -22,7 +22,7 @@ from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import check_scale, load_file, mesh_object, object_in_memory
 from dro_grasp.objects.procedural import PROCEDURAL, procedural_object
 from dro_grasp.objects.reading import ObjectSource, read_geometry
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, with_mass
 
 ASSET_PREFIX = "assets/"  # Prefix of a name that forces the asset
 MAX_SEEDS = 100_000  # Largest such group (ours)
@@ -36,7 +36,9 @@ SCALES = (0.06, 0.08, 0.1, 0.12)  # Scales of every object in the official grasp
 
 
 @checked
-def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False) -> ObjectModel:
+def load_object(
+    source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False, mass: float | None = None
+) -> ObjectModel:
     """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
@@ -47,13 +49,15 @@ def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = 
         name: What to call the object, instead of its own name.
         keep_table: Keep every point of a bare cloud. By default a table in it is found and cut off, with a note, and hands
             stay above it.
+        mass: Mass, in place of density and volume [kg].
 
     Raises:
-        ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
+        ObjectError: The object does not exist, it is unusable, or `scale` or `mass` is not positive.
     """
     check_scale(scale)
     obj = _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table)
-    return obj if name is None else replace(obj, name=name)
+    obj = obj if name is None else replace(obj, name=name)
+    return obj if mass is None else with_mass(obj, mass)
 
 
 def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:

@@ -18,6 +18,7 @@ from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
 DENSITY = 500.0  # Density of every object that states none [kg/m^3]. Source: the official release
+LARGEST_MASS = 100.0  # Largest mass that is accepted [kg] (ours): more are grams, or nothing for a hand
 CLOUD_POINTS = 16384  # Points of an object's stored cloud (ours)
 BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
@@ -146,6 +147,22 @@ class ObjectModel:
         if len(cloud) < 2 * count:
             cloud = self.sample_points(2 * count, generator)
         return cloud[random_half(cloud, count, generator)]
+
+
+def with_mass(obj: ObjectModel, mass: float) -> ObjectModel:
+    """The same object with this mass [kg], spread evenly over its volume; of a bare cloud, over what it encloses.
+
+    Raises:
+        ObjectError: The mass is not above 0, or larger than any hand holds.
+    """
+    if not 0 < mass <= LARGEST_MASS:
+        grams = f"; {mass:g} g are {mass / 1e3:g} kg" if LARGEST_MASS < mass < 1e5 else ""
+        raise ObjectError(
+            f"mass is {mass}; give kilograms, above 0 and at most {LARGEST_MASS:g}, for example --mass 0.4{grams}")
+    heavy = replace(obj, density=mass / (obj.volume or solid_of(obj).volume))
+    if (field := vars(obj).get("distance_field")) is not None:  # a bare cloud's takes a second to compute again
+        vars(heavy)["distance_field"] = field
+    return heavy
 
 
 def solid_of(obj: ObjectModel) -> ObjectModel:

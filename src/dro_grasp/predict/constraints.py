@@ -25,6 +25,7 @@ MIN_UPRIGHT_COSINE = math.cos(math.radians(5.0))
 MIN_PLANE_COSINE = 0.1  # Least such cosine of a plane that has a height at all (ours)
 Z_AXIS_TOLERANCE = 1e-6  # Largest deviation of a z axis that points upwards (ours)
 MAX_PREGRASP_CLEARANCE = 0.2  # Largest pregrasp clearance that is accepted [m] (ours)
+MAX_MARGIN = 10.0  # Largest margin that is accepted (ours)
 MAX_BALLS = 1000  # Most balls of a contact region or keep-out (ours): each costs time at every step
 MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a contact region must contain (ours)
 
@@ -56,6 +57,10 @@ class Constraints(Checked):
     pregrasp_clearance: float | None = None
     """Least distance between the object and every link that closes, in pregrasp [m]: the error of place that the approach
     tolerates. The pregrasp opens as far as that takes. By default joints open by a quarter of the range left."""
+    margin: float | None = None
+    """Multiple of the object's weight that the squeeze holds whichever way gravity pulls; None takes the configuration's."""
+    max_force: float | None = None
+    """Largest normal force of a contact at the squeeze [N], for what is soft or fragile; any by default."""
 
     def __repr__(self) -> str:
         given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
@@ -84,6 +89,12 @@ class Constraints(Checked):
         if self.max_tilt is not None and self.direction is None:
             raise OptionError("max_tilt is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
                               "--max-tilt 0.5")
+        if self.margin is not None and not 0 <= self.margin <= MAX_MARGIN:
+            raise OptionError(f"margin is {self.margin}; give a multiple of the object's weight from 0 to {MAX_MARGIN:g}, for "
+                              "example --margin 1.5")
+        if self.max_force is not None and not 0 < self.max_force < math.inf:
+            raise OptionError(f"max_force is {self.max_force}; give newtons above 0, for example --max-force 5; leave it out "
+                              "where contacts may press as hard as they do")
         if self.pregrasp_clearance is not None and not 0 < self.pregrasp_clearance <= MAX_PREGRASP_CLEARANCE:
             raise OptionError(f"pregrasp_clearance is {self.pregrasp_clearance}; give metres, above 0 and at most "
                               f"{MAX_PREGRASP_CLEARANCE:g}: 0.01 for 1 cm")

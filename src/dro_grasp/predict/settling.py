@@ -7,7 +7,7 @@ the object, so this is no trial; it needs the hand's description. Balls stand fo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.kinds import Checked, renamed
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
@@ -53,12 +54,16 @@ class SettleConfig(Checked):
     """Physics of the second closing, and of the pulls after it."""
     giving_worth: float = 3.0
     """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
+    payload_worth: float = 1.0
+    """What it loses where the payload is a factor of e short of the object's mass with the margin [log-odds]."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
 
+SHORTEST = 0.05
+"""Least share of the needed payload that counts (ours): what carries less is as hopeless."""
 GIVES, TURNS = 0.02, math.radians(15)
 """How far a load may move [m] and turn [rad] what is held. Ours: as under `carry`."""
 
@@ -67,6 +72,20 @@ def giving(state: GraspState) -> Float[Tensor, " n"]:
     """How far the weight moves or turns the object, of what it may; 0 where it was not tried, at most 2."""
     share = torch.maximum(state.gave[:, 0] / GIVES, state.gave[:, 1] / TURNS)
     return share.nan_to_num(0.0).clamp_max(2.0)
+
+
+def lacking_payload(grasps: GraspBatch, needed: float) -> Float[Tensor, " n"]:
+    """By what factor payloads are short of what is needed [kg], as a logarithm; 0 where nothing lacks or it is unknown."""
+    if needed <= 0:
+        return torch.zeros_like(grasps.payload)
+    return (needed / grasps.payload.clamp_min(SHORTEST * needed)).log().clamp_min(0).nan_to_num(0.0)
+
+
+def weight_config(problem: GraspProblem, config: SettleConfig) -> WeightConfig:
+    """How hard grasps press, as the problem asks."""
+    asked = problem.constraints
+    given = {"margin": asked.margin, "max_force": asked.max_force}
+    return replace(config.weight, **{name: value for name, value in given.items() if value is not None})
 
 
 class Settled(NamedTuple):
@@ -107,7 +126,8 @@ def settle_best(
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = scored(problem, closed, score).score
-    held = holding_score(found[stable], state)
+    needed = weight_config(problem, config).margin * problem.mass
+    held = holding_score(found[stable], state) - config.payload_worth * lacking_payload(closed[stable], needed)
     # What gives way under its weight is still better than what does not even hold still.
     found[stable] = torch.maximum(held - config.giving_worth * giving(state), config.unstable_score + held.sigmoid())
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
@@ -139,17 +159,19 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=weight_config(problem, config))
+    depth = deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    better = better.replace(squeeze_joints=squeeze)
+    better = better.replace(
+        squeeze_joints=squeeze.joints, squeeze_torque=squeeze.torque, squeeze_force=squeeze.force, payload=squeeze.payload)
     return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:
-    """The batch with other poses, joints and targets in these rows."""
+    """The batch with other poses, joints, targets and forces in these rows."""
     values = {}
-    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
+    for name in ("T_object_wrist", "joints", *PER_JOINT, *CARRYING):
         values[name] = getattr(grasps, name).clone()
         values[name][rows] = getattr(others, name)
     return grasps.poses_only().replace(**values)

@@ -5,12 +5,12 @@ Nothing pushes the object here, so this is no trial; it tells a squeeze that sli
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import dataclass, field, fields, replace
 
-import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import Rows
@@ -20,9 +20,11 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
+from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads
+from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, quiet, rollouts
-from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
+from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
+from dro_grasp.simulation.scene import scene_of
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
 PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
@@ -30,13 +32,13 @@ FRICTION_SHARE = 0.5  # Share of the friction that the answer may use (ours)
 LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
 CHANGE = 0.3  # Cost of doubling or dropping the force of a contact, beside an unanswered push of UNIT (ours)
 UNIT = 10.0  # Acceleration of the object by which pushes and the forces of contacts are measured [m/s^2] (ours)
-BEARS = 0.05  # Normal force of a contact above which its slip counts [N] (ours)
 EDGES = 6  # Edges of a friction cone (ours)
 RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
 SMALLEST = 1e-3  # Weight of the squared forces beside the weight that they hold (ours)
 PAIRS = ("unanswered", "gave")  # Fields of two columns
 STEPS = 80  # Steps of the solver (ours)
-NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)
+EASINGS = 5  # Times that a hand that presses too hard is eased, at most (ours)
+NEARLY = 0.9  # Share of the largest force that it is then eased to (ours)
 
 
 @dataclass(frozen=True)
@@ -58,57 +60,66 @@ class GraspState(Rows):
 
 
 @dataclass(frozen=True)
-class ContactForces:
-    """Contacts of one configuration with the object; normals point into it."""
+class Squeeze(Rows):
+    """How n hands squeeze, and what comes of it."""
 
-    normal: Float[np.ndarray, "k 3"]
-    arm: Float[np.ndarray, "k 3"]  # from the object's centre of mass [m]
-    point: Float[np.ndarray, "k 3"]  # in the wrist frame [m]
-    link: Int[np.ndarray, " k"]  # the hand's link that each is on
-    pressure: Float[np.ndarray, " k"]  # normal force [N]
-    tangential: Float[np.ndarray, " k"]  # tangential force [N]
-
-    @property
-    def links(self) -> int:
-        """Number of links that they are on."""
-        return len(np.unique(self.link))
-
-    @property
-    def slip(self) -> float:
-        """As in `GraspState`."""
-        bears = self.pressure > BEARS
-        return float((self.tangential[bears] / self.pressure[bears]).max()) if bears.any() else NO_ANSWER
+    joints: Float[Tensor, "n n_dof"]  # targets that press for the object's weight, too [rad or m]
+    torque: Float[Tensor, "n n_dof"]  # what the servos exert there [Nm or N]
+    force: Float[Tensor, " n"]  # sum of the normal forces on the object there [N]
+    payload: Float[Tensor, " n"]  # largest mass that the hand holds where it squeezes for it [kg]
 
 
 def grasp_state(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     config: WeightConfig | None = None, workers: int | None = None
-) -> tuple[GraspState, Float[Tensor, "n n_dof"]]:
+) -> tuple[GraspState, Squeeze]:
     """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`.
 
-    The second result are squeezes that press for the object's weight, too (see `weight_torques`).
+    The second result is how hard to squeeze for the object's weight.
     """
     scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
-    parts, squeezes = [GraspState(**none)], [grasps.joints[:0]]
+    nothing = grasps.joints[:0]
+    parts, squeezes = [GraspState(**none)], [Squeeze(nothing, nothing, nothing.sum(1), nothing.sum(1))]
     for part, rollout in rollouts(scene, hand, grasps, workers):
         closed, state, found = _observed(rollout)
         joints = torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
-        torques = weight_torques(hand, found, joints, torch.from_numpy(rollout.mass).to(joints), config)
-        offset = torques * hand.tree.joint_unit**2 / config.stiffness
-        squeezes.append((part.squeeze_joints + offset).clamp(hand.tree.lower, hand.tree.upper))
-        parts.append(replace(state, gave=_pulled(rollout, closed, squeezes[-1], config)))
-    state = GraspState(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(GraspState)})
-    return state, torch.cat(squeezes)
+        chosen = squeezes_of(hand, found, joints, part.squeeze_joints, config)
+        pressed, squeeze = _pressed(rollout, chosen, config)
+        able = payloads(chosen, state.shift.to(joints), state.turn.to(joints), config.payload)
+        squeezes.append(replace(squeeze, payload=able))
+        parts.append(replace(state, gave=_pulled(rollout, closed, pressed, config)))
+    state, squeeze = (
+        type(many[0])(**{f.name: torch.cat([getattr(one, f.name) for one in many]) for f in fields(many[0])})
+        for many in (parts, squeezes))
+    return state, squeeze
 
 
-def _pulled(
-    rollout: Rollout, closed: ObjectState, squeeze: Float[Tensor, "n n_dof"], config: WeightConfig
-) -> Float[Tensor, "n 2"]:
+def _pressed(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> tuple[ObjectState, Squeeze]:
+    """The object once the hands press for its weight, and how they press.
+
+    Where the contacts of a link press harder than they may, the hand presses less, as often as it takes.
+    """
+    mass = torch.from_numpy(rollout.mass).to(chosen.joints)
+    targets, actuated = chosen.targets(mass[:, None])[:, 0], rollout.scene.actuated
+    for _ in range(EASINGS if math.isfinite(config.max_force) else 1):
+        pressed = rollout.press(targets.numpy()[:, actuated], config.pressing)
+        found = contact_forces(rollout)
+        peak = torch.tensor([c.hardest_link for c in found]).to(mass)
+        share = (NEARLY * config.max_force / peak.clamp_min(1e-9)).clamp_max(1)
+        if not bool((peak > config.max_force).any()):
+            break
+        targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
+    reached = torch.from_numpy(rollout.poses()[0]).to(chosen.joints)
+    torque = replace(chosen, joints=reached).torques_at(targets[:, None])[:, 0]
+    force = torch.tensor([c.pressure.sum() for c in found]).to(mass)
+    return pressed, Squeeze(targets, torque, force, torch.full_like(force, torch.nan))
+
+
+def _pulled(rollout: Rollout, closed: ObjectState, pressed: ObjectState, config: WeightConfig) -> Float[Tensor, "n 2"]:
     """How far pulls move and turn the object while the hand presses for its weight."""
     if config.pull == 0:
         return torch.full((rollout.size, 2), torch.nan)
-    pressed = rollout.press(squeeze.numpy()[:, rollout.scene.actuated], config.pressing)
     alive = pressed.stable & (pressed.shift(closed) < LOST_DISTANCE)
     pulls = Pulls(config.pull * config.gravity, config.pulling, reset=True)
     moved, turned, _ = rollout.push(pressed, alive, pulls)
@@ -120,7 +131,7 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, list[ContactFo
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
-    found = _contacts(rollout)
+    found = contact_forces(rollout)
     columns = {
         "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
@@ -132,38 +143,6 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, list[ContactFo
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
     missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction)
     return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan)), found
-
-
-def _contacts(rollout: Rollout) -> list[ContactForces]:
-    """The contacts with the object in each simulation, with the forces that they bear now."""
-    scene, force = rollout.scene, np.zeros(6)
-    model, data = scene.model, mujoco.MjData(scene.model)
-    names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
-    state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in names}
-    found, links = [], link_of_body(scene)
-    for i in range(rollout.size):
-        for name in names:
-            getattr(data, name)[:] = state[name][i]
-        with quiet():
-            mujoco.mj_forward(model, data)
-        bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)
-        rows = np.flatnonzero((bodies == scene.object_body).any(1))
-        forces = np.zeros((len(rows), 3))
-        for k, row in enumerate(rows):
-            mujoco.mj_contactForce(model, data, row, force)
-            forces[k] = force[:3]
-        into = np.where(bodies[rows, 1] == scene.object_body, 1.0, -1.0)[:, None]
-        touching = bodies[rows][bodies[rows] != scene.object_body]
-        found.append(ContactForces(
-            into * data.contact.frame.reshape(-1, 9)[rows, :3], data.contact.pos[rows] - data.xipos[scene.object_body],
-            data.contact.pos[rows].copy(), links[touching], forces[:, 0], np.linalg.norm(forces[:, 1:], axis=1)))
-    return found
-
-
-def link_of_body(scene: TrialScene) -> Int[np.ndarray, " n_bodies"]:
-    """The hand's link that each body of a scene is; -1 for those of no link."""
-    names = {name: i for i, name in enumerate(scene.hand.tree.link_names)}
-    return np.array([names.get(scene.model.body(b).name.removeprefix(PREFIX), -1) for b in range(scene.model.nbody)], int)
 
 
 @dataclass(frozen=True)
@@ -182,6 +161,8 @@ class WeightConfig(Checked):
     """Edges of a friction cone."""
     iterations: int = 100
     """Steps of the solver."""
+    max_force: float = math.inf
+    """Largest normal force of the contacts of a link [N]; the hand squeezes less where it is exceeded."""
     missing: float = 0.3
     """Share of the weight that may stay without answer; where more does, pressing harder only ejects the object."""
     stiffness: float = 3.0
@@ -192,40 +173,50 @@ class WeightConfig(Checked):
     """Time for which the hand presses before [s]."""
     pulling: float = 0.3
     """Time of each pull [s]."""
+    payload: PayloadConfig = field(default_factory=PayloadConfig)
+    """How payloads are predicted."""
+
+
+def squeezes_of(
+    hand: Hand, contacts: list[ContactForces], joints: Float[Tensor, "n n_dof"], base: Float[Tensor, "n n_dof"],
+    config: WeightConfig,
+) -> Squeezes:
+    """How closed hands squeeze for a mass: towards the base, and by the torques that hold its weight."""
+    touch = pressing(hand, contacts, joints, config.contacts)
+    force = weight_forces(touch, joints.new_ones(len(contacts)), config)
+    torques = torch.einsum("nkc,nkcd->nd", force, touch.jacobian)
+    normal = (force * touch.normal).sum(-1)
+    return Squeezes(hand, joints, base, torques, normal, touch, config.stiffness, config.max_force)
 
 
 def weight_torques(
     hand: Hand, contacts: list[ContactForces], joints: Float[Tensor, "n n_dof"], mass: Float[Tensor, " n"],
     config: WeightConfig | None = None,
 ) -> Float[Tensor, "n n_dof"]:
-    """Torques by which joints press so that contacts hold the weight along each axis and against it [Nm or N].
+    """Torques by which joints press so that contacts hold the weight along each axis and against it [Nm or N]."""
+    config = config or WeightConfig()
+    touch = pressing(hand, contacts, joints, config.contacts)
+    return torch.einsum("nkc,nkcd->nd", weight_forces(touch, mass, config), touch.jacobian)
+
+
+def weight_forces(touch: Pressing, mass: Float[Tensor, " n"], config: WeightConfig) -> Float[Tensor, "n k 3"]:
+    """Forces with which contacts press for the weight along each axis and against it [N].
 
     For each way of gravity, the least forces within the friction cones that balance the weight; their mean balances itself,
     and each contact presses in it for its share of whichever weight there is. Where contacts cannot hold it, nothing is added.
     """
-    config, n = config or WeightConfig(), len(contacts)
+    n, k = touch.on.shape
     if config.margin == 0 or n == 0:
-        return torch.zeros_like(joints)
-    k, tree = config.contacts, hand.tree
-    normal, arm, point = (joints.new_zeros(n, k, 3) for _ in range(3))
-    normal[..., 2], on, link = 1.0, joints.new_zeros(n, k), torch.zeros(n, k, dtype=torch.int64)
-    for i, c in enumerate(contacts):
-        kept = np.argsort(-c.pressure)[:k]
-        for table, values in ((normal, c.normal), (arm, c.arm), (point, c.point), (link, c.link)):
-            table[i, :len(kept)] = torch.as_tensor(values[kept]).to(table)
-        on[i, :len(kept)] = 1
-    cone = friction_cone(normal, config.friction, config.edges) * on[..., None, None]
-    wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1).flatten(1, 2).mT
-    pulls = torch.as_tensor(FORCES).to(joints)
+        return torch.zeros_like(touch.normal)
+    cone = friction_cone(touch.normal, config.friction, config.edges) * touch.on[..., None, None]
+    wrench = torch.cat([cone, torch.linalg.cross(touch.arm[..., None, :].expand_as(cone) / LEVER, cone)], -1).flatten(1, 2).mT
+    pulls = torch.as_tensor(FORCES).to(mass)
     goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).repeat(n, 1)
     amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, SMALLEST, config.iterations)
     missing = ((wrench.repeat_interleave(len(pulls), 0) @ amounts[..., None])[..., 0] - goal).norm(dim=-1)
     able = missing.reshape(n, len(pulls)).amax(1) < config.missing
     mean = amounts.unflatten(0, (n, len(pulls))).mean(1).unflatten(1, (k, config.edges))
-    force = (config.margin * config.gravity * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
-    jacobian = torch.stack([
-        tree.point_jacobian(pose, p, at) for pose, p, at in zip(tree.forward(joints), point, link.clamp_min(0), strict=True)])
-    return torch.einsum("nkc,nkcd->nd", force, jacobian) * hand.movable
+    return (config.margin * config.gravity * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
 
 
 def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:

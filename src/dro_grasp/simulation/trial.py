@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
@@ -139,7 +140,7 @@ def settle(
         holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
         joints.append(torch.where(holding, reached, part.joints))
         poses.append(T_object_wrist)
-    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
+    unsettled = grasps.without(*PER_JOINT, *CARRYING, "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
 
 

@@ -17,7 +17,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.grasps.batch import GraspBatch, distinct
-from dro_grasp.grasps.columns import CAMERA, FAILURE, OBJECT_SCALE, POSTURES, REASON
+from dro_grasp.grasps.columns import CAMERA, CARRYING, FAILURE, OBJECT_SCALE, POSTURES, REASON
 from dro_grasp.grasps.grasp_file import encode, table_bytes
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
@@ -182,8 +182,8 @@ def compact(hand: Hand, grasps: GraspBatch) -> GraspBatch:
         name: _short(value) if isinstance(value, Tensor) and value.is_floating_point() and name not in EXACT else value
         for name, value in grasps.extra.items() if name not in PLAIN_COLUMNS
     }
-    numbers = {name: getattr(grasps, name) for name in ("score", "energy", "displacement", "rotation", "penetration")}
-    short = {name: _short(value) for name, value in numbers.items()}
+    rounded = "score", "energy", "displacement", "rotation", "penetration", *CARRYING, "squeeze_torque"
+    short = {name: _short(getattr(grasps, name)) for name in rounded}
     return grasps.replace(T_object_wrist=T, joints=joints, extra=extra, **postures, **short)
 
 
