@@ -24,6 +24,9 @@ from dro_grasp.grasps.forces import forces_in_words, forces_of_all, squeeze_effo
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.settling import SettleConfig
+from dro_grasp.simulation.rollout import Rollout, rollouts
+from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
 from tests.helpers.loaded_hands import loaded_hand
 
 COUPLED = ("barrett", "shadowhand")  # built-in hands some of whose joints follow others
@@ -128,6 +131,43 @@ def test_an_effort_does_the_work_of_all_joints_that_follow(hand: Hand) -> None:
     assert message["grasp_posture"]["joint_names"] == list(tree.joint_names)
     expected = small * np.einsum("jd,j->d", tree.coupling.numpy(), by_joint)
     np.testing.assert_allclose(point["effort"], expected, atol=2e-7 + 1e-4 * np.abs(expected).max())
+
+
+def test_the_efforts_of_predicted_grasps_balance_their_contacts() -> None:
+    """Pressed in MuJoCo, the hand's contacts ask of its joints what the file says, followers included."""
+    hand, obj = loaded_hand("barrett"), load_object("can")
+    grasps = dro.GraspPredictor().predict(hand, obj, num=3, seed=0, source="optimiser", candidates=2)
+    messages = yaml.safe_load(contents(hand, grasps, "moveit"))
+    efforts = np.array([message["grasp_posture"]["points"][0]["effort"] for message in messages])
+    scene = scene_of(hand, obj, grasps, SettleConfig().protocol)
+    ((_, rollout),) = rollouts(scene, hand, grasps, 1)
+    rollout.close()
+    rollout.press(grasps.squeeze_joints.numpy()[:, scene.actuated], 0.6)
+    pressed = [balancing(scene, rollout, i) for i in range(len(grasps))]
+    np.testing.assert_allclose(efforts, [torque for torque, _ in pressed], atol=0.12 * float(find_efforts(hand).limit.min()))
+    forces = [message["max_contact_force"] for message in messages]
+    np.testing.assert_allclose(forces, [force for _, force in pressed], rtol=0.15)
+    assert np.abs(efforts).max() > 0.3 * float(find_efforts(hand).limit.min()), "nothing presses"
+
+
+def balancing(scene: TrialScene, rollout: Rollout, i: int) -> tuple[np.ndarray, float]:
+    """What the forces on the object ask of the independent joints now, by MuJoCo's Jacobians, and the sum of normal forces."""
+    model, data, tree, found = scene.model, mujoco.MjData(scene.model), scene.hand.tree, np.zeros(6)
+    for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
+        getattr(data, name)[:] = np.array(rollout.batch.bind(name))[i]
+    mujoco.mj_forward(model, data)
+    asked, normal = np.zeros(model.nv), 0.0
+    for k, contact in enumerate(data.contact):
+        bodies = model.geom_bodyid[contact.geom]
+        if scene.object_body in bodies:
+            mujoco.mj_contactForce(model, data, k, found)
+            onto = 1.0 if bodies[1] == scene.object_body else -1.0
+            force, torque = (onto * contact.frame.reshape(3, 3).T @ part for part in (found[:3], found[3:]))
+            link = bodies[0] if onto > 0 else bodies[1]
+            mujoco.mj_applyFT(model, data, force, torque, contact.pos, link, asked)
+            normal += found[0]
+    by_joint = [asked[model.joint(PREFIX + name).dofadr[0]] for name in tree.moving_names]
+    return np.array(by_joint) @ tree.coupling.numpy(), normal
 
 
 def test_moveit(hand: Hand, grasps: GraspBatch, clipped: np.ndarray) -> None:
