@@ -221,7 +221,7 @@ class Generate:
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
         from dro_grasp.grasps.batch import percent
         from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-        from dro_grasp.grasps.forces import forces_of_all, known
+        from dro_grasp.grasps.forces import forces_of_all, known, short
         from dro_grasp.simulation.outcome import diagnose
 
         rows = []
@@ -230,9 +230,9 @@ class Generate:
             if grasps.evaluated[i]:
                 outcome = [bool(grasps.success[i]), len(grasps.extra[CONTACT_LINKS][i]), float(grasps.penetration[i]) * 1e3,
                            grasps.extra[REASON][i]]
-            forces = known(grasps.payload[i]), known(grasps.squeeze_force[i])
+            forces = (None if x is None else short(x) for x in (known(grasps.payload[i]), known(grasps.squeeze_force[i])))
             rows.append([i, origin[i], percent(float(grasps.confidence[i])), *forces, *outcome])
-        columns = ["grasp", "origin", "confidence", "carries [kg]", "squeezes [N]", "success", "contacts", "penetration [mm]",
+        columns = ["grasp", "origin", "confidence", "carries [kg]", "squeeze [N]", "success", "contacts", "penetration [mm]",
                    "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)

@@ -37,8 +37,8 @@ def known(value: Float[Tensor, ""]) -> float | None:
 
 def forces_in_words(payload: float | None, squeeze_force: float | None) -> str:
     """What one grasp carries [kg], and with what force it squeezes [N]; empty if both are unknown."""
-    carried = None if payload is None else f"carries {_short(payload)} kg"
-    pressed = None if squeeze_force is None else f"squeezes with {_short(squeeze_force)} N"
+    carried = None if payload is None else f"carries {short(payload)} kg"
+    pressed = None if squeeze_force is None else f"squeezes with {short(squeeze_force)} N"
     return ", ".join(filter(None, (carried, pressed)))
 
 
@@ -50,9 +50,10 @@ def forces_of_all(grasps: GraspBatch) -> str:
 
 
 def _range(values: Float[Tensor, " k"]) -> str:
-    ends = dict.fromkeys(_short(float(end)) for end in (values.min(), values.max()))
+    ends = dict.fromkeys(short(float(end)) for end in (values.min(), values.max()))
     return " to ".join(ends)
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
+    """A mass or force as precise as it is meant [kg or N]."""
     return f"{value:.0f}" if value >= COARSE else f"{value:.2g}"
