@@ -61,6 +61,7 @@ from .predict.sources.registry import make_source as make_source, register_sourc
 from .predict.sources.source import Candidates as Candidates, Source as Source
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .simulation.contacts import ContactQuality as ContactQuality, measure_contacts as measure_contacts
+from .simulation.forces import GraspForces as GraspForces, find_forces as find_forces
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate

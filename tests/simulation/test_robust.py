@@ -99,7 +99,7 @@ def test_conditions_in_a_shared_scene_are_those_of_a_scene_compiled_with_them(ha
     scene = cached_scene(hand, obj, rules)
     closing = complete(hand, grasps, torch.zeros(3), rules.controller)
     conditions = draw(rules.perturbations, grasps).rows(slice(3 * len(grasps), 4 * len(grasps)))
-    shared = trials._run(Rollout(scene, closing, 1, conditions=conditions), measure_penetration(scene, grasps))
+    shared = trials.run_trial(Rollout(scene, closing, 1, conditions=conditions), measure_penetration(scene, grasps))
     torch.testing.assert_close(shared.displacement, alone.displacement, atol=1e-8, rtol=1e-5, equal_nan=True)
     torch.testing.assert_close(shared.rotation, alone.rotation, atol=1e-6, rtol=1e-5, equal_nan=True)
     torch.testing.assert_close(shared.closing_shift, alone.closing_shift, atol=1e-8, rtol=1e-5)

@@ -98,8 +98,7 @@ class Benchmark:
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), seed=self.seed, view=self.view,
             views=self.views, device=self.device, contact_quality=self.contact_quality, mass=self.mass,
-            constraints=Constraints(margin=self.margin, max_force=self.max_force),
-        )
+            constraints=Constraints(margin=self.margin, max_force=self.max_force))
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, methods, config, progress)
         if not rows:

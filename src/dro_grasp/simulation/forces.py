@@ -1,123 +1,156 @@
-"""Forces of closed hands: what presses where, what mass each grasp can carry, and how hard it has to squeeze.
+"""Forces of closed hands: what presses where, what joints exert, and what mass each grasp carries.
 
-A grasp carries a mass if, whichever way gravity pulls, forces within the friction cones of its contacts balance the weight, and
-no joint needs more torque than its effort. That is a linear program, exact for pyramids in place of the cones; friction about
-the normals counts as that of soft fingers does. Source: Kerr and Roth 1986, with gravity from all sides; ours otherwise.
+Three answers to the last. What a squeezing hand holds by itself is predicted (see `payload`), or weighed in simulation,
+where the mass grows. A linear program says what the contacts as they are allow at most, with forces that suit each direction
+of gravity. Source of the program: Kerr and Roth 1986, with gravity from all sides; ours otherwise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.optimize import linprog
 from scipy.sparse import block_diag, csr_matrix, hstack
+from torch import Tensor
 
-from dro_grasp.geometry.contact_forces import friction_cone
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked
-from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.contacts import find_contacts
+from dro_grasp.objects.shape import ObjectModel, solid_of
+from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
 from dro_grasp.simulation.outcome import FORCES
+from dro_grasp.simulation.payload import GRAVITY, PayloadConfig, Squeezes, generators, payloads, servo_torques
+from dro_grasp.simulation.pressure import ContactForces, contact_forces
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
-from dro_grasp.simulation.rollout import rollouts
-from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
+from dro_grasp.simulation.rollout import Rollout, rollouts
+from dro_grasp.simulation.scene import scene_of
 
-GRAVITY = 9.81  # [m/s^2]
-
-
-@dataclass(frozen=True)
-class ForceConfig(Checked):
-    """How forces are computed (ours)."""
-
-    friction: float = 0.5
-    """Largest coefficient that is relied on."""
-    edges: int = 8
-    """Edges of the pyramid that stands for a friction cone."""
-    gap: float = 5e-4
-    """Contacts that are farther apart do not press [m]."""
+SPAN = 4.0  # Least and largest mass that is weighed, as a factor of the predicted payload (ours)
+STAGES = 28  # Stages in which the mass grows (ours)
+STAGE = 0.02  # Duration of each [s] (ours)
+LAG = 1.45
+"""By what factor the mass has grown until an object that gives way has moved. Ours: fitted on training hands and objects."""
 
 
 @dataclass(frozen=True)
-class Touch:
-    """k contacts of one closed hand with the object, in the wrist frame, and what forces there do."""
+class GraspForces:
+    """Forces of n grasps of one object."""
 
-    points: Float[np.ndarray, "k 3"]  # [m]
-    inward: Float[np.ndarray, "k 3"]  # unit normals into the object
-    links: Int[np.ndarray, " k"]
-    wrench: Float[np.ndarray, "6 g"]
-    """Force [N], and torque about the object's centre of mass [Nm], of each generator: edges of cones with a normal force of
-    1 N, and the same with torsion either way."""
-    torque: Float[np.ndarray, "n_dof g"]  # of the joints that exert each generator [Nm or N]
+    grasp_contacts: tuple[ContactForces, ...]
+    """Contacts with the object where the servos' targets are the joints of the grasp."""
+    squeeze_contacts: tuple[ContactForces, ...]
+    """The same at the squeeze."""
+    grasp_torque: Float[Tensor, "n n_dof"]
+    """Torques of the joints there [Nm, N where they slide]."""
+    squeeze_torque: Float[Tensor, "n n_dof"]
+    """The same at the squeeze."""
+    payload: Float[Tensor, " n"]
+    """Largest mass that each grasp holds whichever way gravity pulls, where it squeezes as stated and for its weight [kg]."""
+    largest_payload: Float[Tensor, " n"]
+    """What the contacts as they are, friction and efforts allow, if every contact pressed as it should [kg]."""
 
-
-def touches(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol, config: ForceConfig) -> Iterator[Touch]:
-    """The contacts of each grasp after the protocol's closing."""
-    scene = scene_of(hand, obj, grasps, protocol)
-    for _, rollout in rollouts(scene, hand, grasps, workers=1):
-        rollout.close()
-        joints, _ = rollout.poses()
-        for q, qpos in zip(joints, rollout.qpos, strict=True):
-            yield _touch(scene, q, qpos, config)
-
-
-def _touch(scene: TrialScene, q: Float[np.ndarray, " n_dof"], qpos: Float[np.ndarray, " nq"], config: ForceConfig) -> Touch:
-    hand, names = scene.hand, [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
-    (found,) = find_contacts(scene.model, qpos[None])
-    on = (found.bodies == scene.object_body).any(1) & (found.distance < config.gap)
-    bodies, points, normal = found.bodies[on], found.position[on], found.normal[on]
-    first = bodies[:, 0] == scene.object_body  # normals point from the first body to the second
-    inward = np.where(first[:, None], -normal, normal)
-    link_of = {name: i for i, name in enumerate(hand.tree.link_names)}
-    links = np.array([link_of[names[b]] for b in np.where(first, bodies[:, 1], bodies[:, 0])], int)
-    return _generators(scene, q, points, inward, links, qpos[scene.object_qpos][:3], config)
+    @property
+    def squeeze_force(self) -> Float[Tensor, " n"]:
+        """Sum of the normal forces on the object at the squeeze [N]."""
+        return torch.tensor([c.pressure.sum() for c in self.squeeze_contacts], dtype=torch.float32)
 
 
-def _generators(
-    scene: TrialScene, q: Float[np.ndarray, " n_dof"], points: Float[np.ndarray, "k 3"], inward: Float[np.ndarray, "k 3"],
-    links: Int[np.ndarray, " k"], centre: Float[np.ndarray, "3"], config: ForceConfig,
-) -> Touch:
-    tree, rules = scene.hand.tree, scene.protocol
-    edges = friction_cone(torch.from_numpy(inward), min(rules.friction, config.friction), config.edges).numpy()
-    twist = rules.torsional_friction * np.stack([inward, -inward], 1)
-    force = np.concatenate([edges, np.repeat(inward[:, None], 2, 1)], 1)
-    moment = np.cross((points - centre)[:, None], force)
-    moment[:, config.edges:] += twist
-    q_ = torch.from_numpy(q).to(tree.origin)
-    jacobian = tree.point_jacobian(tree.forward(q_), torch.from_numpy(points).to(tree.origin), torch.from_numpy(links)).double()
-    spin = tree.motion_axes(tree.forward(q_))[1].double()  # angular velocity of each link by its own joint
-    turning = torch.einsum("kl,lc,ld->kcd", tree.descends[links].double(), spin, tree.link_coupling.double())
-    torque = np.einsum("kgc,kcd->dkg", force, jacobian.numpy())
-    torque[:, :, config.edges:] += np.einsum("kgc,kcd->dkg", twist, turning.numpy())
-    wrench = np.concatenate([force, moment], -1).transpose(2, 0, 1)
-    return Touch(points, inward, links, wrench.reshape(6, -1), torque.reshape(tree.n_dof, -1))
+def find_forces(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "carry", *, config: WeightConfig | None = None,
+    weigh: bool = False, workers: int | None = None,
+) -> GraspForces:
+    """Close hands gradually in simulation and read the forces.
 
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object; balls stand for a bare cloud.
+        grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
+        protocol: Physics of the closing.
+        config: How grasps squeeze for a weight.
+        weigh: Let the mass grow in simulation, instead of predicting the payload: nearer to what trials say, in 20 times the
+            time.
+        workers: Threads; all cores by default.
 
-def payloads(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "carry", config: ForceConfig | None = None
-) -> Float[np.ndarray, " n"]:
-    """The largest mass that each grasp can carry in every direction of gravity [kg]."""
-    effort = find_efforts(hand).limit.double().numpy()
-    return np.array([payload(t, effort) for t in touches(hand, obj, grasps, find_protocol(protocol), config or ForceConfig())])
-
-
-def payload(touch: Touch, effort: Float[np.ndarray, " n_dof"], compliance: float | None = None) -> float:
-    """The largest mass that forces of contacts balance along each of FORCES [kg]; 0 without contact.
-
-    Amounts of the generators are scaled to a weight of 1 N per direction; then the largest share of an effort is least.
+    Raises:
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
     """
-    g, n = touch.wrench.shape[1], len(effort)
+    obj, config, rules = solid_of(obj), config or WeightConfig(), replace(find_protocol(protocol), gradual=True, closing=True)
+    whole = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
+    nothing, none = grasps.joints[:0], grasps.joints.new_zeros(0)
+    parts = [GraspForces((), (), nothing, nothing, none, none)]
+    for part, rollout in rollouts(scene_of(hand, obj, whole, rules), hand, whole, workers):
+        parts.append(_forces(rollout, part, config, weigh))
+    return GraspForces(*(
+        torch.cat(column) if isinstance(column[0], Tensor) else tuple(one for many in column for one in many)
+        for column in zip(*([getattr(p, name) for name in GraspForces.__dataclass_fields__] for p in parts), strict=True)))
+
+
+def _forces(rollout: Rollout, grasps: GraspBatch, config: WeightConfig, weigh: bool) -> GraspForces:
+    """Both halves of the closing, and what is read after each."""
+    hand, begin, seen = rollout.scene.hand, rollout.start, []
+    first, middle, last = rollout.targets
+    for targets, wanted in (([first, middle], grasps.joints), ([middle, last], grasps.squeeze_joints)):
+        rollout.targets = targets
+        closed, joints = rollout.close(), torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
+        seen.append((tuple(contact_forces(rollout)), servo_torques(hand, joints, wanted, config.stiffness)))
+    (before, weak), (after, firm) = seen
+    chosen = squeezes_of(hand, list(after), joints, grasps.squeeze_joints, config)
+    shift, turn = (torch.from_numpy(x).to(joints) for x in (closed.shift(begin), closed.turn(begin)))
+    payload = payloads(chosen, shift, turn, config.payload)
+    if weigh:
+        payload = weighed(rollout, chosen, payload, config.payload)
+    return GraspForces(before, after, weak, firm, payload, largest_payloads(chosen, config.payload).to(payload))
+
+
+def weighed(
+    rollout: Rollout, chosen: Squeezes, guess: Float[Tensor, " n"], config: PayloadConfig
+) -> Float[Tensor, " n"]:
+    """The mass at which each closed hand lets go while it grows, along the worst of six directions [kg].
+
+    The hand squeezes for the mass as it grows, from a share of the guess to a multiple of it.
+    """
+    guess = guess.clamp(config.least * SPAN, config.most / SPAN)
+    closed, least = rollout.moment(), SPAN * guess.numpy()
+    for axis in FORCES:
+        rollout.go_back(closed)
+        held = np.ones(rollout.size, bool)
+        for mass in torch.logspace(-1, 1, STAGES).to(guess)[:, None] ** np.log10(SPAN) * guess:
+            targets = chosen.targets(mass[:, None])[:, 0].numpy()[:, rollout.scene.actuated]
+            now = rollout.load(targets, GRAVITY * mass.double().numpy()[:, None] * axis, STAGE)
+            gone = (now.shift(rollout.start) > config.give) | (now.turn(rollout.start) > config.turn) | ~now.stable
+            least = np.where(held & gone, np.minimum(least, mass.numpy()), least)
+            held &= ~gone
+    rollout.go_back(closed)
+    return (torch.from_numpy(least).to(guess) / LAG).clamp_max(config.most)
+
+
+def largest_payloads(chosen: Squeezes, config: PayloadConfig) -> Float[Tensor, " n"]:
+    """The largest mass that forces of contacts balance along each of FORCES, whatever forces these are [kg]."""
+    wrench, torque, _ = (x.double().numpy() for x in generators(chosen.contacts, config))
+    effort = find_efforts(chosen.hand).limit.double().numpy()
+    on = (np.abs(wrench).sum(1) > 0)
+    return torch.tensor([largest_payload(w[:, g], t[:, g], effort) for w, t, g in zip(wrench, torque, on, strict=True)])
+
+
+def largest_payload(
+    wrench: Float[np.ndarray, "6 g"], torque: Float[np.ndarray, "n_dof g"], effort: Float[np.ndarray, " n_dof"]
+) -> float:
+    """The largest mass that g forces of any amounts balance along each of FORCES, within the efforts [kg]; 0 without any.
+
+    Amounts are scaled to a weight of 1 N per direction; then the largest share of an effort is least.
+    """
+    g, n, count = wrench.shape[1], len(effort), len(FORCES)
     if g == 0:
         return 0.0
-    count = len(FORCES)
-    shares = touch.torque / effort[:, None]
+    shares = torque / effort[:, None]
     # Variables: amounts for each direction, effort's share t.
-    equal = hstack([block_diag([csr_matrix(touch.wrench)] * count), csr_matrix((6 * count, 1))])
+    equal = hstack([block_diag([csr_matrix(wrench)] * count), csr_matrix((6 * count, 1))])
     load = np.concatenate([np.concatenate([-f, np.zeros(3)]) for f in FORCES])
     both = np.vstack([shares, -shares])
     bound = hstack([block_diag([csr_matrix(both)] * count), csr_matrix(-np.ones((2 * n * count, 1)))])

@@ -16,15 +16,16 @@ from torch import Tensor
 from dro_grasp.devices import Rows
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
-from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads
+from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, servo_torques
 from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
-from dro_grasp.simulation.scene import scene_of
+from dro_grasp.simulation.scene import TrialScene, scene_of
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
 PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
@@ -37,8 +38,8 @@ RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
 SMALLEST = 1e-3  # Weight of the squared forces beside the weight that they hold (ours)
 PAIRS = ("unanswered", "gave")  # Fields of two columns
 STEPS = 80  # Steps of the solver (ours)
-EASINGS = 5  # Times that a hand that presses too hard is eased, at most (ours)
-NEARLY = 0.9  # Share of the largest force that it is then eased to (ours)
+EASINGS = 6  # Times that hands close to find out how hard they may squeeze (ours)
+NEARLY = 0.9  # Share of the largest force of a link that they then use (ours)
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,8 @@ def grasp_state(
     """
     scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
+    if math.isfinite(config.max_force):
+        grasps = _gentle(scene, grasps, NEARLY * config.max_force, workers)
     nothing = grasps.joints[:0]
     parts, squeezes = [GraspState(**none)], [Squeeze(nothing, nothing, nothing.sum(1), nothing.sum(1))]
     for part, rollout in rollouts(scene, hand, grasps, workers):
@@ -95,23 +98,41 @@ def grasp_state(
     return state, squeeze
 
 
-def _pressed(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> tuple[ObjectState, Squeeze]:
-    """The object once the hands press for its weight, and how they press.
+def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
+    """The grasps with squeezes as near to the grasp as it takes for no link to press harder than `most` after closing [N]."""
+    whole = complete(scene.hand, grasps, torch.as_tensor(scene.obj.centre_of_mass, dtype=torch.float32))
+    firm, low, high = whole.squeeze_joints, torch.zeros(len(whole)), torch.ones(len(whole))
 
-    Where the contacts of a link press harder than they may, the hand presses less, as often as it takes.
-    """
+    def eased(share: Float[Tensor, " n"]) -> GraspBatch:
+        return whole.replace(squeeze_joints=whole.joints + share[:, None] * (firm - whole.joints))
+
+    share = high
+    for _ in range(EASINGS):
+        fits = []
+        for _, rollout in rollouts(scene, scene.hand, eased(share), workers):
+            rollout.close()
+            fits += [c.hardest_link <= most for c in contact_forces(rollout)]
+        fit = torch.tensor(fits, dtype=torch.bool)
+        low, high = torch.where(fit, share, low), torch.where(fit, high, share)
+        if bool((low == 1).all()):
+            break
+        share = (low + high) / 2
+    return eased(low)
+
+
+def _pressed(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> tuple[ObjectState, Squeeze]:
+    """The object once the hands press for its weight, and how they press; as before where a link then presses too hard."""
     mass = torch.from_numpy(rollout.mass).to(chosen.joints)
     targets, actuated = chosen.targets(mass[:, None])[:, 0], rollout.scene.actuated
-    for _ in range(EASINGS if math.isfinite(config.max_force) else 1):
+    for _ in range(2):
         pressed = rollout.press(targets.numpy()[:, actuated], config.pressing)
         found = contact_forces(rollout)
-        peak = torch.tensor([c.hardest_link for c in found]).to(mass)
-        share = (NEARLY * config.max_force / peak.clamp_min(1e-9)).clamp_max(1)
-        if not bool((peak > config.max_force).any()):
+        harder = torch.tensor([c.hardest_link for c in found]) > config.max_force
+        if not bool(harder.any()):
             break
-        targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
+        targets = torch.where(harder[:, None], chosen.base, targets)
     reached = torch.from_numpy(rollout.poses()[0]).to(chosen.joints)
-    torque = replace(chosen, joints=reached).torques_at(targets[:, None])[:, 0]
+    torque = servo_torques(chosen.hand, reached, targets, chosen.stiffness)
     force = torch.tensor([c.pressure.sum() for c in found]).to(mass)
     return pressed, Squeeze(targets, torque, force, torch.full_like(force, torch.nan))
 
@@ -182,8 +203,9 @@ def squeezes_of(
     config: WeightConfig,
 ) -> Squeezes:
     """How closed hands squeeze for a mass: towards the base, and by the torques that hold its weight."""
-    touch = pressing(hand, contacts, joints, config.contacts)
-    force = weight_forces(touch, joints.new_ones(len(contacts)), config)
+    touch = pressing(hand, contacts, joints, max(config.contacts, config.payload.contacts))
+    force = weight_forces(touch.hardest(config.contacts), joints.new_ones(len(contacts)), config)
+    force = torch.nn.functional.pad(force, (0, 0, 0, touch.on.shape[1] - force.shape[1]))
     torques = torch.einsum("nkc,nkcd->nd", force, touch.jacobian)
     normal = (force * touch.normal).sum(-1)
     return Squeezes(hand, joints, base, torques, normal, touch, config.stiffness, config.max_force)

@@ -33,8 +33,10 @@ class PayloadConfig(Checked):
     """Coefficient of friction. Source: protocol `carry`."""
     torsion: float = 0.005
     """Torsional friction [m]. Source: protocol `carry`."""
+    contacts: int = 20
+    """Most contacts of a grasp that count, those that press hardest: with 12, the ranks of payloads agree less."""
     edges: int = 6
-    """Edges of a friction cone."""
+    """Edges of the pyramid that stands for a friction cone, of the same area across."""
     least: float = 0.01
     """Smallest mass that is tried [kg]; a grasp that does not hold it has a payload of 0."""
     most: float = 20.0
@@ -49,6 +51,8 @@ class PayloadConfig(Checked):
     """Farthest that it may turn [rad]. Source: protocol `carry`."""
     remainder: float = 30.0
     """What of the load the contacts leave, moves the object as a spring of this stiffness would [N/m]."""
+    unheld: float = 0.3
+    """Largest share of the load that the contacts may leave."""
     softness: float = 2e-4
     """How far contacts give way [m/N]."""
     iterations: int = 80
@@ -77,7 +81,7 @@ class Squeezes:
         shrink alike, as others would not balance.
         """
         unit, tree = self.hand.tree.joint_unit**2 / self.stiffness, self.hand.tree
-        base, anyhow = self._eased(), self.contacts.pressure
+        base, anyhow = self.base, self.contacts.pressure
         left = (find_efforts(self.hand).limit - ((base - self.joints) / unit).abs()).clamp_min(0)
         share = (left[:, None] / (mass[..., None] * self.torques.abs()[:, None]).clamp_min(1e-9)).amin(-1)
         if math.isfinite(self.max_force):
@@ -87,18 +91,13 @@ class Squeezes:
         added_torques = mass[..., None] * share.clamp_max(1)[..., None] * self.torques[:, None]
         return (base[:, None] + added_torques * unit).clamp(tree.lower, tree.upper)
 
-    def _eased(self) -> Float[Tensor, "n n_dof"]:
-        """The base, as much weaker as `max_force` asks."""
-        if not math.isfinite(self.max_force):
-            return self.base
-        peak = by_link(self.contacts.pressure, self.contacts).amax(1)
-        return self.joints + (self.max_force / peak.clamp_min(1e-9)).clamp_max(1)[:, None] * (self.base - self.joints)
 
-    def torques_at(self, targets: Float[Tensor, "n m n_dof"]) -> Float[Tensor, "n m n_dof"]:
-        """What the servos of the closed hands exert then, within their efforts [Nm or N]."""
-        limit = find_efforts(self.hand).limit
-        springs = (targets - self.joints[:, None]) * self.stiffness / self.hand.tree.joint_unit**2
-        return springs.clamp(-limit, limit) * self.hand.movable
+def servo_torques(
+    hand: Hand, joints: Float[Tensor, "*n n_dof"], targets: Float[Tensor, "*n n_dof"], stiffness: float
+) -> Float[Tensor, "*n n_dof"]:
+    """What servos exert with the hand at these joints, within their efforts [Nm or N]."""
+    limit = find_efforts(hand).limit
+    return ((targets - joints) * stiffness / hand.tree.joint_unit**2).clamp(-limit, limit) * hand.movable
 
 
 def payloads(
@@ -119,10 +118,12 @@ def payloads(
     moved, turned = given_way(squeezes, masses, config)
     room = (config.give - shift).clamp_min(LEAST_ROOM * config.give), (config.turn - turn).clamp_min(LEAST_ROOM * config.turn)
     used = torch.maximum(moved.amax(-1) / room[0][:, None], turned.amax(-1) / room[1][:, None])
+    left = config.remainder * moved.amax(-1) / (GRAVITY * masses)
+    used = torch.maximum(used, left / config.unheld)
     return _crossing(masses, used)
 
 
-LEAST_ROOM = 0.1  # Share of what an object may move that is left to it however far closing moved it (ours)
+LEAST_ROOM = 0.4  # Share of what an object may move that is left to it however far closing moved it (ours)
 
 
 def given_way(
@@ -130,9 +131,10 @@ def given_way(
 ) -> tuple[Float[Tensor, "n m 6"], Float[Tensor, "n m 6"]]:
     """How far each mass, pulled along each of FORCES, moves [m] and turns [rad] the object in each hand."""
     n, m, touch = len(squeezes.joints), len(masses), squeezes.contacts
-    wrench, torque, hessian = _generators(touch, config)
+    wrench, torque, hessian = generators(touch, config)
     soft = squeezes.hand.tree.joint_unit**2 / config.servo
-    springs = squeezes.torques_at(squeezes.targets(masses.expand(n, m)))
+    targets = squeezes.targets(masses.expand(n, m))
+    springs = servo_torques(squeezes.hand, squeezes.joints[:, None].expand_as(targets), targets, squeezes.stiffness)
     pulls = torch.as_tensor(FORCES).to(masses)
     load = GRAVITY * masses[:, None, None] * torch.cat([pulls, torch.zeros_like(pulls)], 1)
     stored = (springs * soft) @ torque
@@ -143,11 +145,12 @@ def given_way(
     return left[..., :3].norm(dim=-1) / config.remainder, left[..., 3:].norm(dim=-1) / (config.remainder * LEVER)
 
 
-def _generators(
+def generators(
     touch: Pressing, config: PayloadConfig
 ) -> tuple[Float[Tensor, "n 6 g"], Float[Tensor, "n n_dof g"], Float[Tensor, "n g g"]]:
     """Of each edge of a cone, and of torsion either way: wrench, torques of joints, and compliance of the contacts."""
-    cone = friction_cone(touch.normal, config.friction, config.edges)
+    corner = 2 * math.pi / config.edges
+    cone = friction_cone(touch.normal, config.friction * math.sqrt(corner / math.sin(corner)), config.edges)
     force = torch.cat([cone, touch.normal[:, :, None].expand(-1, -1, 2, -1)], 2) * touch.on[..., None, None]
     twist = torch.zeros_like(force)
     twist[:, :, -2], twist[:, :, -1] = (sign * config.torsion * touch.on[..., None] * touch.normal for sign in (1, -1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import mujoco
 import numpy as np
@@ -90,6 +90,10 @@ class Pressing:
     pressure: Float[Tensor, "n k"]  # normal force [N]
     jacobian: Float[Tensor, "n k 3 n_dof"]  # motion of the point by each joint
     spin: Float[Tensor, "n k 3 n_dof"]  # rotation of its link by each joint
+
+    def hardest(self, count: int) -> Pressing:
+        """The contacts that press hardest."""
+        return Pressing(**{f.name: getattr(self, f.name)[:, :count] for f in fields(self)})
 
 
 def pressing(hand: Hand, contacts: Sequence[ContactForces], joints: Float[Tensor, "n n_dof"], most: int) -> Pressing:

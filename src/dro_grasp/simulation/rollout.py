@@ -161,6 +161,23 @@ class Rollout:
         self._advance(np.arange(self.size), self._steps(seconds))
         return self.observe()
 
+    def load(
+        self, targets: Float[np.ndarray, "n n_servos"], force: Float[np.ndarray, "n 3"], seconds: float
+    ) -> ObjectState:
+        """Press towards targets under a force on each object [N], in the frame that it had at the start, for a time [s]."""
+        self.force[:, self.scene.object_body, :3] = np.einsum("nij,nj->ni", self.start.rotation, force)
+        return self.press(targets, seconds)
+
+    def moment(self) -> dict[str, Float[np.ndarray, "n k"]]:
+        """What it takes to go on from here later; see `go_back`."""
+        return {name: np.array(self.batch.bind(name)) for name in STATE}
+
+    def go_back(self, moment: dict[str, Float[np.ndarray, "n k"]]) -> None:
+        """Return all trials to an earlier moment, without forces."""
+        self.force[:] = 0
+        for name, values in moment.items():
+            self.batch.bind(name)[:] = values
+
     def push(
         self, closed: ObjectState, alive: Bool[np.ndarray, " n"], pulls: Pulls | None = None
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:

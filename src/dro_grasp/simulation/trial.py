@@ -51,7 +51,7 @@ def simulate(
     results, done = [], 0
     for part, rollout in rollouts(scene, hand, grasps, workers):
         penetration = measure_penetration(scene, part)
-        result = _run(rollout, penetration)
+        result = run_trial(rollout, penetration)
         if scene.protocol.perturbations.trials > 1:
             result = _repeated(scene, part, result, penetration, workers)
         results.append(result)
@@ -76,13 +76,14 @@ def record(
     if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1).shown):
         conditions = draw(scene.protocol.perturbations, grasp).rows(slice(shown - 1, shown))
         rollout = Rollout(_scene_of_trial(scene, shown), grasp, workers=1, stride=stride, conditions=conditions)
-    _run(rollout, penetration)
+    run_trial(rollout, penetration)
     joints, poses = (
         torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*rollout.frames, strict=True))
     return poses, joints
 
 
-def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
+def run_trial(rollout: Rollout, penetration: Penetration) -> TrialResult:
+    """Close the hands of a rollout and push the objects."""
     scene, rules = rollout.scene, rollout.scene.protocol
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)
@@ -110,7 +111,7 @@ def _repeated(
                 continue
             index, own = rows.repeat(end - begin), conditions.rows(slice((begin - 1) * len(rows), (end - 1) * len(rows)))
             rollout = Rollout(_scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own)
-            trials.append(_run(rollout, penetration.rows(index.numpy())))
+            trials.append(run_trial(rollout, penetration.rows(index.numpy())))
         results.append(verdict(TrialResult.join(trials, first.protocol), rules.trials, rules.needed))
     return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
 

@@ -27,6 +27,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
+from tests.helpers.claw_urdf import claw, joint, written
 from tests.helpers.loaded_hands import loaded_hand
 
 COUPLED = ("barrett", "shadowhand")  # built-in hands some of whose joints follow others
@@ -131,6 +132,23 @@ def test_an_effort_does_the_work_of_all_joints_that_follow(hand: Hand) -> None:
     assert message["grasp_posture"]["joint_names"] == list(tree.joint_names)
     expected = small * np.einsum("jd,j->d", tree.coupling.numpy(), by_joint)
     np.testing.assert_allclose(point["effort"], expected, atol=2e-7 + 1e-4 * np.abs(expected).max())
+
+
+def test_a_motor_that_moves_two_jaws_presses_with_half_its_effort_each(tmp_path: Path) -> None:
+    more = '<limit lower="0" upper="0.03" effort="60" velocity="1"/>'
+    joints = joint("a", "palm", "left", "-0.035 0 0.01", "1 0 0", more, "prismatic") + joint(
+        "b", "palm", "right", "0.035 0 0.01", "-1 0 0", f'{more}<mimic joint="a"/>', "prismatic")
+    hand = dro.load_hand(str(written(tmp_path, claw(joints=joints))))
+    assert hand.tree.joint_names == ("a",)
+    left, right = (hand.tree.link_names.index(name) for name in ("left", "right"))
+    poses = hand.tree.forward(torch.tensor([0.01]))
+    inward = torch.tensor([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]])  # 5 N of each jaw on the object between them
+    jacobian = hand.tree.point_jacobian(poses, poses[[left, right], :3, 3], torch.tensor([left, right]))
+    torque = torch.einsum("kc,kcd->d", inward, jacobian)[None]
+    grasps = posed(hand, 1).replace(squeeze_torque=torque, squeeze_force=torch.tensor([10.0]))
+    (message,) = yaml.safe_load(contents(hand, grasps, "moveit"))
+    assert message["grasp_posture"]["points"][0]["effort"] == pytest.approx([10.0])
+    assert message["max_contact_force"] == 10.0
 
 
 def test_the_efforts_of_predicted_grasps_balance_their_contacts() -> None:
