@@ -149,10 +149,10 @@ class MotionPlan:
         n = self.notes
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
+        forces = f"; it {told}" if (told := forces_in_words(n.payload, n.squeeze_force)) else ""
         return [
             grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
-            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'",
-            *filter(None, [forces_in_words(n.payload, n.squeeze_force)]),
+            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'{forces}",
             f"motion of {self.seconds:.1f} s: {spans}",
             "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
         ]
