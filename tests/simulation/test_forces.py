@@ -56,7 +56,7 @@ def pinched(hand: Hand, force: float, lever: float = 0.05) -> Squeezes:
 
 @pytest.mark.parametrize(("force", "friction"), [(4.0, 0.2), (8.0, 0.2), (8.0, 0.1)])
 def test_two_fingers_hold_by_friction_what_they_press(hand: Hand, force: float, friction: float) -> None:
-    # Once it slips, the object spreads the fingers as it would on slopes; it may therefore move little here, as stiff springs do.
+    # Once it slips, the object spreads the fingers as slopes would; so it may move little here.
     give = 1.5 * friction * force * 0.05**2 / 3.0
     config = PayloadConfig(friction=friction, torsion=0.02, masses=60, iterations=6000, remainder=3.0, edges=32, give=give, softness=1e-6)
     found = float(payloads(pinched(hand, force), torch.zeros(1), torch.zeros(1), config))
