@@ -7,6 +7,7 @@ let it fold back closes on nothing on the way from there.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry import se3
-from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point
+from dro_grasp.hands.anatomy import PARALLEL, Finger, JointMask, Joints, Point
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
@@ -36,6 +37,8 @@ ROLLING_UP = 8.0
 say little are often half a turn for each joint."""
 SPREADING = (1.0, 0.75)
 """Openness at which joints that move a finger sideways are looked for (ours): bent farther, they move it to the palm, too."""
+LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
+IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
 STILL = 5e-3  # Slower fingertips do not move with a joint [m/rad or m/m] (ours)
 
 
@@ -84,6 +87,25 @@ class FingerMotion:
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
 
+    def level(self, q: Joints) -> Bool[Tensor, " n_tips"]:
+        """Fingers that bend towards one side of a plane in which their knuckles are, as those of a flat hand."""
+        velocities, everything = self.velocities(q), torch.ones(self.tree.n_dof, dtype=torch.bool)
+        speed, normal = velocities.norm(dim=1), main_axis(velocities.mT.reshape(-1, 3))
+        alike = (velocities * normal[:, None]).sum(1).abs().amax(-1) > LEVEL * speed.amax(-1)
+        height, reach = self.knuckles(q, everything) @ normal, self.reaches(q, everything).norm(dim=-1)
+        return alike & ((height - height.median()).abs() < IN_PLANE * reach)
+
+    def hinges(self, q: Joints) -> JointMask:
+        """Joints that turn a finger about an axis parallel to that of another of its joints, or that are all it has."""
+        axes, turns = self.tree.motion_axes(self.tree.forward(q))[1], torch.tensor(self.tree.kind) == REVOLUTE
+        found = torch.zeros(self.tree.n_dof, dtype=torch.bool)
+        for finger in self.fingers:
+            links = torch.tensor([link for link in finger.chain if turns[link]], dtype=torch.long)
+            alike = (axes[links] @ axes[links].T).abs() > PARALLEL
+            hinges = links[(alike.sum(1) > 1) | (len(links) == 1)]
+            found |= (self.tree.link_coupling[hinges] != 0).any(0)
+        return found
+
     def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
         """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
@@ -122,20 +144,31 @@ class FingerMotion:
 
     def widest(self, axis: Line, start: Joints, bends: JointMask) -> Joints:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
+        return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
+
+    def straightest(self, start: Joints, bends: JointMask) -> Joints:
+        """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+
+    def _best(self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask) -> Joints:
         q, tree = start, self.tree
         for _ in range(SWEEPS):
             before = q
-            for joint in bends.nonzero()[:, 0].tolist():
+            for joint in moved.nonzero()[:, 0].tolist():
                 values = torch.linspace(float(tree.lower[joint]), float(tree.upper[joint]), STEPS + 1)
                 values = torch.cat([start[joint, None], values])
                 values = values[(values - start[joint]).abs().argsort(stable=True)]
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
-                total = axis.span(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
+                total = measure(tried)
                 q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
+
+    def knuckle_joints(self, bends: JointMask) -> JointMask:
+        """The joints that move the knuckles' links: beyond them, fingers are straight or bent."""
+        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends
 
     def folded(self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line) -> Bool[Tensor, " n_tips"]:
         """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
