@@ -28,7 +28,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import FingerMotion, Line, main_axis
+from dro_grasp.hands.opening import FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -337,7 +337,7 @@ class ClosingFinder:
     def better_side(self, spread: Joints) -> tuple[Joints, Palm]:
         """Opening signs of a hand that closes from here to the side where it encloses a ball best, and the palm there."""
         velocity, still = self.motion.velocities(spread), torch.zeros_like(self.movable)
-        normal, sides = main_axis(velocity.mT.reshape(-1, 3)), []
+        normal, sides = self.motion.way_of_bending(spread), []
         for side in (normal, -normal):
             signs = self.away_from_limits(spread, torch.where((velocity * side[:, None]).sum((0, 1)) >= 0, -1.0, 1.0))
             with contextlib.suppress(HandError):

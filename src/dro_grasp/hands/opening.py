@@ -87,11 +87,16 @@ class FingerMotion:
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
 
+    def way_of_bending(self, q: Joints) -> Point:
+        """Unit vector along which most fingertips move when fingers bend, forth or back."""
+        hinges = self.hinges(q)
+        return main_axis((self.velocities(q)[..., hinges] if bool(hinges.any()) else self.velocities(q)).mT.reshape(-1, 3))
+
     def level(self, q: Joints) -> Bool[Tensor, " n_tips"]:
         """Fingers that bend towards one side of a plane in which their knuckles are, as those of a flat hand."""
-        velocities, everything = self.velocities(q), torch.ones(self.tree.n_dof, dtype=torch.bool)
-        speed, normal = velocities.norm(dim=1), main_axis(velocities.mT.reshape(-1, 3))
-        alike = (velocities * normal[:, None]).sum(1).abs().amax(-1) > LEVEL * speed.amax(-1)
+        velocities, normal = self.velocities(q) * self.hinges(q), self.way_of_bending(q)
+        everything = torch.ones(self.tree.n_dof, dtype=torch.bool)
+        alike = (velocities * normal[:, None]).sum(1).abs().amax(-1) > LEVEL * velocities.norm(dim=1).amax(-1)
         height, reach = self.knuckles(q, everything) @ normal, self.reaches(q, everything).norm(dim=-1)
         return alike & ((height - height.median()).abs() < IN_PLANE * reach)
 
