@@ -24,6 +24,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
+from dro_grasp.hands.usable_range import range_notes
 
 TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
@@ -79,7 +80,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *effort_notes(hand),
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *range_notes(hand), *effort_notes(hand),
              *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
