@@ -28,7 +28,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import FingerMotion, Line
+from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -168,10 +168,6 @@ ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
-FAR_BACK = 0.7  # Angle from which on a joint bends a finger far back [rad] (ours); fingers of hands bend back by 0.5 at most
-BOTH_WAYS = 0.9
-"""Least share of the way that a joint closes its finger by which it also bends it back, for that its limits are taken to say
-nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has 0.71."""
 AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
 PATH = 65  # Postures on the way from closed to open at which a hand is examined (ours)
 AT_LIMIT = 0.1  # Distance to a limit, as a share of the range, within which a joint is at this limit (ours)
@@ -245,7 +241,7 @@ class ClosingFinder:
         bends, palm = self.bending(abduction), found.palm
         axis = Line(_tensor(palm.centre), _tensor(palm.direction))
         straight = self.motion.straightest(self.start, bends)
-        straight = self.motion.widest(axis, straight, self.motion.knuckle_joints(bends))
+        straight = self.motion.widest(axis, straight, self.motion.knuckle_joints(bends) & self.motion.hinges(straight))
         cut = bends if everywhere else self.both_ways(straight, abduction)
         if not bool(cut.any()):
             return None

@@ -37,6 +37,10 @@ ROLLING_UP = 8.0
 say little are often half a turn for each joint."""
 SPREADING = (1.0, 0.75)
 """Openness at which joints that move a finger sideways are looked for (ours): bent farther, they move it to the palm, too."""
+FAR_BACK = 0.7  # Angle from which on a joint bends a finger far back [rad] (ours); fingers of hands bend back by 0.5 at most
+BOTH_WAYS = 0.9
+"""Least share of the way that a joint closes its finger by which it also bends it back, for that its limits are taken to say
+nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has 0.71."""
 LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
 IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
 STILL = 5e-3  # Slower fingertips do not move with a joint [m/rad or m/m] (ours)
@@ -224,7 +228,20 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes
+    return notes if (guess := _guessed_side(hand)) is None else [*notes, guess]
+
+
+def _guessed_side(hand: Hand) -> Note | None:
+    """A flat hand whose limits do not tell its palm's side: its fingers, but for a thumb, bend as far back as forth."""
+    stated = hand.tree if hand.description is None else hand.description.tree
+    beyond = torch.where(hand.opening_signs > 0, stated.upper - hand.open_ends, hand.open_ends - stated.lower)
+    both = (beyond >= BOTH_WAYS * (hand.closed_ends - hand.open_ends).abs()) & (beyond > FAR_BACK)
+    lasts = [int(joints.nonzero()[-1, 0]) for tip in hand.tips if bool((joints := hand.tree.moves[tip] & hand.movable).any())]
+    level = FingerMotion.of(hand).level((stated.lower + stated.upper) / 2)
+    if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
+        return None
+    return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is a "
+                "guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from dro_grasp.hands.anatomy import JointMask, Joints, Point
+from dro_grasp.hands.anatomy import JointMask, Joints
 from dro_grasp.hands.closing import Closing
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
@@ -22,8 +22,8 @@ from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.opening import FingerMotion
 
 NONSENSE = 2 * math.pi - 0.1
-"""Range from which on the limits of a finger's joint say nothing [rad] (ours): a whole turn, or half of one both ways, as joints
-without limits get."""
+"""Range from which on the limits of a finger's joint say nothing [rad] (ours): a whole turn, or half of one both ways, as
+joints without limits get."""
 FARTHEST_BEND = 1.75  # Angle by which such a joint bends at most [rad] (ours): 100 degrees; joints of hands bend by 1.3 to 1.9
 FARTHEST_SPREAD = 0.35  # The same for joints that spread fingers [rad] (ours): people's spread by 20 degrees
 STRAIGHT = 0.85  # Share of its longest reach from which on a finger is straight at rest (ours)
