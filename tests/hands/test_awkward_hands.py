@@ -136,3 +136,14 @@ def test_the_variants_are_the_same_mechanism(folder: Path) -> None:
             mine = hand.tree.forward(q)
             for tip, other in zip(hand.tips, plain.tips, strict=True):
                 torch.testing.assert_close(mine[:, tip, :3, 3], theirs[:, other, :3, 3], atol=1e-5, rtol=0)
+
+
+def test_a_hand_limited_to_its_use_is_the_hand_but_for_its_limits(folder: Path) -> None:
+    """The network's grasps are fitted within them."""
+    _, hand, _ = reworded(folder, "gripper3", "both ways")
+    used = hand.limited_to_use()
+    assert float((used.tree.lower - hand.tree.lower).max()) > 1.0, "the outer links open straight"
+    assert torch.equal(used.tree.lower, hand.lower)
+    assert torch.equal(used.tree.upper, hand.upper)
+    plain = original(folder, "gripper3")[1]
+    assert plain.limited_to_use() is plain

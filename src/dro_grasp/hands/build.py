@@ -157,7 +157,8 @@ class HandBuilder:
             palm_centre=to_palm(closing.palm.centre),
             palm_direction=T[:3, :3] @ torch.tensor(closing.palm.direction, dtype=torch.float32),
             grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs,
-            open_ends=closing.open_ends.clamp(tree.lower, tree.upper), movable=self.movable, rest=rest, abduction=closing.abduction,
+            open_ends=closing.open_ends.clamp(tree.lower, tree.upper), movable=self.movable, rest=rest,
+            abduction=closing.abduction,
             contact_links=tuple(i for i in self.links if i in collides),
             sha256=self.description.sha256, description=self.description,
         ).with_thumb()

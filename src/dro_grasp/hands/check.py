@@ -81,8 +81,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *opening_notes(hand), *range_notes(hand), *effort_notes(hand),
-             *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *opening_notes(hand),
+             *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -173,8 +173,8 @@ def _sliding_notes(hand: Hand) -> list[Note]:
     if float((ways @ ways.T).min()) < SAME_WAY:
         return []
     names = ", ".join(hand.tree.link_names[tip] for tip in hand.tips)
-    return [Note("warning", names, "slide the same way when the hand closes, so they hold nothing between them; turn the axis of "
-                 "one of their joints, or the sign of its multiplier")]
+    return [Note("warning", names, "slide the same way when the hand closes, so they hold nothing between them; turn the "
+                 "axis of one of their joints, or the sign of its multiplier")]
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:

@@ -254,7 +254,8 @@ class ClosingFinder:
 
     def both_ways(self, straight: Joints, abduction: JointMask) -> JointMask:
         """Joints that bend a finger far, and as far back as forth from where it is straight."""
-        tree = self.tree  # one that turns a finger about something else than its other joints, as a thumb's first, does not bend it
+        # One that turns a finger about something else than its other joints, as a thumb's first, does not bend it.
+        tree = self.tree
         ways = torch.stack([straight - tree.lower, tree.upper - straight])
         back, forth = ways.amin(0), ways.amax(0)
         return self.bending(abduction) & self.motion.hinges(straight) & (back > FAR_BACK) & (back >= BOTH_WAYS * forth)

@@ -159,7 +159,10 @@ class FingerMotion:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
         return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
 
-    def _best(self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask) -> Joints:
+    def _best(
+        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask
+    ) -> Joints:
+        """The posture that measures most, found joint by joint."""
         q, tree = start, self.tree
         for _ in range(SWEEPS):
             before = q
@@ -240,8 +243,8 @@ def _guessed_side(hand: Hand) -> Note | None:
     level = FingerMotion.of(hand).level((stated.lower + stated.upper) / 2)
     if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
         return None
-    return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is a "
-                "guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
+    return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is "
+                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:

@@ -11,8 +11,9 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from dro_grasp.hands.anatomy import JointMask, Joints
 from dro_grasp.hands.closing import Closing
@@ -80,7 +81,7 @@ def in_use(
     return dataclasses.replace(tree, lower=lower, upper=upper)
 
 
-def _reaching(at_palm: torch.Tensor) -> int | None:
+def _reaching(at_palm: Bool[Tensor, " steps"]) -> int | None:
     """The first step at which a fingertip comes to the palm; it may have begun there."""
     arrives = at_palm[1:] & ~at_palm[:-1]
     return int(arrives.float().argmax()) + 1 if bool(arrives.any()) else None
