@@ -105,3 +105,13 @@ def test_contacts_are_not_sought_with_fingers_out_of_reach() -> None:
     assert len(set(one.tolist())) == 1  # out of reach, all slots go to the finger that is nearest
     assert len(set(reached[0].tolist())) == reached.shape[1]
     assert energy(far, q).total.isfinite().all()
+
+
+def test_refinement_opens_no_finger_beyond_the_hand(disturbed: GraspBatch) -> None:
+    """Of a hand that opens only half as far as its limits; a grasp that is beyond already goes no farther."""
+    half = dataclasses.replace(HAND, open_ends=(HAND.open_ends + HAND.closed_ends) / 2)
+    energy = GraspEnergy.of_object(half, load_object("can"), CONFIG.energy)
+    refined = refine_grasps(energy, disturbed)
+    before, after = ((half.lower - grasps.joints).maximum(grasps.joints - half.upper) for grasps in (disturbed, refined))
+    assert float(before.max()) > 0.05, "some grasps are beyond"
+    assert bool((after <= before.clamp_min(0) + 1e-5).all())

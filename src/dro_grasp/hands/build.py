@@ -23,7 +23,8 @@ from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.description.tree_reading import LinkGeometry
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
-from dro_grasp.hands.opening import ROLLING_UP
+from dro_grasp.hands.opening import ROLLING_UP, FingerMotion
+from dro_grasp.hands.usable_range import in_use, sensibly_limited, without_sense
 
 SAMPLES_PER_LINK = 512
 """Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
@@ -145,8 +146,9 @@ class HandBuilder:
 
     def build(self, name: str) -> Hand:
         """The hand with all of its samples."""
-        tree, closing, surface = self.tree, self.closing, self.surface
-        T = torch.linalg.inv(tree.forward(self.rest)[self.palm])
+        tree, closing, surface = self.used_tree, self.closing, self.surface
+        rest = self.rest.clamp(tree.lower, tree.upper)
+        T = torch.linalg.inv(tree.forward(rest)[self.palm])
         to_palm = lambda p: T[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T[:3, 3]  # noqa: E731
         collides = {g.link for g in self.description.geometry if g.collides}
         return Hand(
@@ -155,7 +157,8 @@ class HandBuilder:
             palm_centre=to_palm(closing.palm.centre),
             palm_direction=T[:3, :3] @ torch.tensor(closing.palm.direction, dtype=torch.float32),
             grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs,
-            open_ends=closing.open_ends, movable=self.movable, rest=self.rest, abduction=closing.abduction,
+            open_ends=closing.open_ends.clamp(tree.lower, tree.upper), movable=self.movable, rest=rest,
+            abduction=closing.abduction,
             contact_links=tuple(i for i in self.links if i in collides),
             sha256=self.description.sha256, description=self.description,
         ).with_thumb()
@@ -241,13 +244,28 @@ class HandBuilder:
         return mask if mask.any() else np.ones(len(mask), bool)
 
     @cached_property
+    def motion(self) -> FingerMotion:
+        """Fingertips as functions of joints, with sensible limits."""
+        middles = torch.stack([self.coarse.middle(finger.tip) for finger in self.fingers])
+        motion = FingerMotion(self.tree, self.fingers, middles)
+        return dataclasses.replace(motion, tree=sensibly_limited(motion, self.rest, self.movable, self.stated))
+
+    @cached_property
+    def used_tree(self) -> KinematicTree:
+        """The tree, with limits of joints that state none that make sense where they are of use."""
+        wide = without_sense(self.tree, self.movable)
+        rest = self.rest.clamp(self.motion.tree.lower, self.motion.tree.upper)
+        return in_use(self.motion, wide, self.closing, rest, self.coarse.posed(self.tree, rest)[0][self.on_palm])
+
+    @cached_property
     def closing(self) -> Closing:
         """From where and to where the joints close, and the palm."""
-        finder = ClosingFinder(self.tree, self.rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
+        rest = self.rest.clamp(self.motion.tree.lower, self.motion.tree.upper)
+        finder = ClosingFinder(self.motion.tree, rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
                                sideways=torch.zeros_like(self.movable))
         found = finder.find()
         # Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
-        if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(self.tree.lower, self.tree.upper) >= ROLLING_UP:
+        if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(finder.tree.lower, finder.tree.upper) >= ROLLING_UP:
             with contextlib.suppress(HandError):  # nothing is enclosed so early
                 early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
                 return early if early.palm.score > found.palm.score + MUCH_BETTER else found

@@ -21,9 +21,10 @@ from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.kinematics.tree import KinematicTree
+from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
+from dro_grasp.hands.usable_range import range_notes
 
 TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
@@ -31,6 +32,7 @@ COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "directio
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
+SAME_WAY = 0.9  # Cosine from which on jaws move the same way (ours)
 END = {1: "upper", -1: "lower"}  # Limit at which a joint is open, by opening sign
 THIN_VOLUME = 1e-9  # Volume below which a link's shapes enclose nothing [m^3] (ours)
 
@@ -79,8 +81,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *effort_notes(hand),
-             *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *opening_notes(hand),
+             *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -161,6 +163,20 @@ def _finger_notes(hand: Hand) -> list[Note]:
     return [Note("warning", tip, "is the only fingertip; it can only press an object against the palm. Is a finger missing?")]
 
 
+def _sliding_notes(hand: Hand) -> list[Note]:
+    """Jaws that all slide the same way hold nothing between them."""
+    opened, closed = (FingerMotion.of(hand).tips(hand.canonical_joints(x)) for x in (1.0, 0.0))
+    slides = torch.tensor([any(hand.tree.kind[link] == PRISMATIC for link in finger.chain) for finger in hand.fingers])
+    if len(hand.fingers) < 2 or not bool(slides.all()):
+        return []
+    ways = torch.nn.functional.normalize(closed - opened, dim=-1)
+    if float((ways @ ways.T).min()) < SAME_WAY:
+        return []
+    names = ", ".join(hand.tree.link_names[tip] for tip in hand.tips)
+    return [Note("warning", names, "slide the same way when the hand closes, so they hold nothing between them; turn the "
+                 "axis of one of their joints, or the sign of its multiplier")]
+
+
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
     notes = []
     for link, name in enumerate(hand.tree.link_names):
@@ -195,10 +211,10 @@ def picture(hand: Hand, path: Path | str) -> None:
     sheet = Image.new("RGB", (2 * width, height + 2 * line), (255, 255, 255))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
     camera = _camera(hand)
-    for column, (title, openness) in enumerate((("open", 1.0), ("closed", 0.25))):
+    for column, (title, openness) in enumerate((("open", 1.0), ("three quarters closed", 0.25))):
         sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, line))
         pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
-    legend = "orange: contact links   grey: others   red: palm direction   blue: fingertips from open to closed"
+    legend = "orange: contact links   grey: others   red: palm direction   blue: the ways of fingertips"
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)

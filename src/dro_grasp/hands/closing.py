@@ -25,10 +25,10 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
 
 from dro_grasp.errors import HandError
-from dro_grasp.hands.anatomy import PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
+from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import FingerMotion, Line, main_axis
+from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -168,6 +168,7 @@ ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
+AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
 PATH = 65  # Postures on the way from closed to open at which a hand is examined (ours)
 AT_LIMIT = 0.1  # Distance to a limit, as a share of the range, within which a joint is at this limit (ours)
 
@@ -197,14 +198,67 @@ class ClosingFinder:
     closings: tuple[float, ...] = CLOSINGS  # shares of the way from open to closed at which the hand is examined
 
     def find(self) -> Closing:
-        """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
+        """The closing between the limits, or from the widest posture of fingers that fold or bend back beyond it."""
         found = self.between_limits()
         if self.fixed_jaw(found.open_ends, found.opening_signs, found.abduction) is not None:
             return found
-        if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
-            return self.from_widest()
-        other = dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
-        return other.unrolled(found) if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()) else found
+        if (sideless := self.without_side(found)) is not None:
+            return sideless
+        folded = bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any())
+        other = self.spreading(found)
+        if not folded and bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()):
+            return other.unrolled(found)
+        straightened = other.straight_about(found)
+        return straightened or (self.from_widest() if folded else found)
+
+    def spreading(self, found: Closing) -> ClosingFinder:
+        """The same, but joints that move fingers sideways are taken to spread them."""
+        return dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
+
+    def without_side(self, found: Closing) -> Closing | None:
+        """The closing of a hand whose limits do not tell on which side its palm is; None of others.
+
+        These are flat hands of which every last joint, but for a thumb's, bends as far back as forth.
+        """
+        other = self.spreading(found)
+        straight = self.motion.straightest((self.tree.lower + self.tree.upper) / 2, other.bending(found.abduction))
+        last = [int(joints.nonzero()[-1, 0]) for finger in self.fingers
+                if bool((joints := self.tree.moves[finger.tip] & self.movable).any())]
+        enough = len(last) - (len(last) >= FEWEST_WITH_THUMB)
+        both = other.both_ways(straight, found.abduction)[last]
+        if not 0 < enough <= min(int(both.sum()), int(self.motion.level(straight).sum())):
+            return None
+        signs, palm = other.better_side(straight)
+        abduction = other.out_of_palm(straight, signs, palm) & self.movable
+        closing = other.straight_about(Closing(signs, straight, abduction, palm), everywhere=True)
+        if closing is None or float(_tensor(closing.palm.direction) @ _tensor(palm.direction)) > AHEAD:
+            return closing
+        return dataclasses.replace(closing, palm=palm)  # its thumb, which opens otherwise now, would turn it
+
+    def straight_about(self, found: Closing, everywhere: bool = False) -> Closing | None:
+        """The closing about a palm of fingers that open straight, everywhere or where they bend both ways; None: nowhere."""
+        abduction = (found.abduction | self.sideways) & self.movable
+        bends, palm = self.bending(abduction), found.palm
+        axis = Line(_tensor(palm.centre), _tensor(palm.direction))
+        straight = self.motion.straightest(self.start, bends)
+        straight = self.motion.widest(axis, straight, self.motion.knuckle_joints(bends) & self.motion.hinges(straight))
+        cut = bends if everywhere else self.both_ways(straight, abduction)
+        if not bool(cut.any()):
+            return None
+        signs = self.signs_from(straight, found.opening_signs, abduction, _tensor(palm.grasp_centre))
+        return self.narrowed(cut, straight, signs)
+
+    def bending(self, abduction: JointMask) -> JointMask:
+        """Joints that may bend a finger, and whose open posture no file states."""
+        return self.movable & ~abduction & ~self.sideways & self.stated.isnan()
+
+    def both_ways(self, straight: Joints, abduction: JointMask) -> JointMask:
+        """Joints that bend a finger far, and as far back as forth from where it is straight."""
+        # One that turns a finger about something else than its other joints, as a thumb's first, does not bend it.
+        tree = self.tree
+        ways = torch.stack([straight - tree.lower, tree.upper - straight])
+        back, forth = ways.amin(0), ways.amax(0)
+        return self.bending(abduction) & self.motion.hinges(straight) & (back > FAR_BACK) & (back >= BOTH_WAYS * forth)
 
     def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
         """Least share of each finger's reach at the widest spread that it keeps on the way from there to its open ends."""
@@ -280,14 +334,23 @@ class ClosingFinder:
     def better_side(self, spread: Joints) -> tuple[Joints, Palm]:
         """Opening signs of a hand that closes from here to the side where it encloses a ball best, and the palm there."""
         velocity, still = self.motion.velocities(spread), torch.zeros_like(self.movable)
-        normal, sides = main_axis(velocity.mT.reshape(-1, 3)), []
+        normal, sides = self.motion.way_of_bending(spread), []
         for side in (normal, -normal):
             signs = self.away_from_limits(spread, torch.where((velocity * side[:, None]).sum((0, 1)) >= 0, -1.0, 1.0))
             with contextlib.suppress(HandError):
-                sides.append((signs, self.examine(spread, signs, still)))
+                palm = self.examine(spread, signs, still)
+                ahead = float(_tensor(palm.direction) @ side) > AHEAD
+                sides.append((ahead, palm.score + self.lean(side), signs, palm))
         if not sides:
             raise HandError(NOTHING_ENCLOSED)
-        return max(sides, key=lambda pair: pair[1].score)
+        return max(sides, key=lambda found: found[:2])[2:]
+
+    def lean(self, side: Point) -> float:
+        """How far the fingers of the hand at rest lean to one side of the palm, and a thumb stands out there [m]."""
+        height = self.motion.tips(self.rest) @ side
+        curl = height - self.motion.knuckles(self.rest, self.movable) @ side
+        aside = (height - height.median()).sum() if len(self.fingers) >= FEWEST_WITH_THUMB else 0.0
+        return float(curl.sum() + aside)
 
     def signs_at_limits(self, signs: Joints, abduction: JointMask, spreads: JointMask, centre: Point) -> Joints:
         """Opening signs by what each joint does from limit to limit, with the others at rest or, by these signs, half closed.

@@ -147,6 +147,12 @@ class Hand:
                 mask[link] = bool(spread[1] > 1e-4)
         return mask
 
+    def limited_to_use(self) -> Hand:
+        """The same hand, whose joints have their open and closed ends as limits; this hand if they do already."""
+        if torch.equal(self.lower, self.tree.lower) and torch.equal(self.upper, self.tree.upper):
+            return self
+        return dataclasses.replace(self, tree=dataclasses.replace(self.tree, lower=self.lower, upper=self.upper))
+
     def canonical_joints(self, openness: float = 0.75) -> Float[Tensor, " n_dof"]:
         """Open-hand joints [rad or m]: this share of the way from the closed to the open end; held joints at rest."""
         return self._opened(self.rest.new_full((self.tree.n_dof,), openness))

@@ -7,6 +7,7 @@ let it fold back closes on nothing on the way from there.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry import se3
-from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point
+from dro_grasp.hands.anatomy import PARALLEL, Finger, JointMask, Joints, Point
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
@@ -36,6 +37,12 @@ ROLLING_UP = 8.0
 say little are often half a turn for each joint."""
 SPREADING = (1.0, 0.75)
 """Openness at which joints that move a finger sideways are looked for (ours): bent farther, they move it to the palm, too."""
+FAR_BACK = 0.7  # Angle from which on a joint bends a finger far back [rad] (ours); fingers of hands bend back by 0.5 at most
+BOTH_WAYS = 0.9
+"""Least share of the way that a joint closes its finger by which it also bends it back, for that its limits are taken to say
+nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has 0.71."""
+LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
+IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
 STILL = 5e-3  # Slower fingertips do not move with a joint [m/rad or m/m] (ours)
 
 
@@ -84,6 +91,30 @@ class FingerMotion:
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
 
+    def way_of_bending(self, q: Joints) -> Point:
+        """Unit vector along which most fingertips move when fingers bend, forth or back."""
+        hinges = self.hinges(q)
+        return main_axis((self.velocities(q)[..., hinges] if bool(hinges.any()) else self.velocities(q)).mT.reshape(-1, 3))
+
+    def level(self, q: Joints) -> Bool[Tensor, " n_tips"]:
+        """Fingers that bend towards one side of a plane in which their knuckles are, as those of a flat hand."""
+        velocities, normal = self.velocities(q) * self.hinges(q), self.way_of_bending(q)
+        everything = torch.ones(self.tree.n_dof, dtype=torch.bool)
+        alike = (velocities * normal[:, None]).sum(1).abs().amax(-1) > LEVEL * velocities.norm(dim=1).amax(-1)
+        height, reach = self.knuckles(q, everything) @ normal, self.reaches(q, everything).norm(dim=-1)
+        return alike & ((height - height.median()).abs() < IN_PLANE * reach)
+
+    def hinges(self, q: Joints) -> JointMask:
+        """Joints that turn a finger about an axis parallel to that of another of its joints, or that are all it has."""
+        axes, turns = self.tree.motion_axes(self.tree.forward(q))[1], torch.tensor(self.tree.kind) == REVOLUTE
+        found = torch.zeros(self.tree.n_dof, dtype=torch.bool)
+        for finger in self.fingers:
+            links = torch.tensor([link for link in finger.chain if turns[link]], dtype=torch.long)
+            alike = (axes[links] @ axes[links].T).abs() > PARALLEL
+            hinges = links[(alike.sum(1) > 1) | (len(links) == 1)]
+            found |= (self.tree.link_coupling[hinges] != 0).any(0)
+        return found
+
     def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
         """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
@@ -122,20 +153,34 @@ class FingerMotion:
 
     def widest(self, axis: Line, start: Joints, bends: JointMask) -> Joints:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
+        return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
+
+    def straightest(self, start: Joints, bends: JointMask) -> Joints:
+        """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+
+    def _best(
+        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask
+    ) -> Joints:
+        """The posture that measures most, found joint by joint."""
         q, tree = start, self.tree
         for _ in range(SWEEPS):
             before = q
-            for joint in bends.nonzero()[:, 0].tolist():
+            for joint in moved.nonzero()[:, 0].tolist():
                 values = torch.linspace(float(tree.lower[joint]), float(tree.upper[joint]), STEPS + 1)
                 values = torch.cat([start[joint, None], values])
                 values = values[(values - start[joint]).abs().argsort(stable=True)]
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
-                total = axis.span(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
+                total = measure(tried)
                 q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
+
+    def knuckle_joints(self, bends: JointMask) -> JointMask:
+        """The joints that move the knuckles' links: beyond them, fingers are straight or bent."""
+        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends
 
     def folded(self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line) -> Bool[Tensor, " n_tips"]:
         """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
@@ -186,7 +231,20 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes
+    return notes if (guess := _guessed_side(hand)) is None else [*notes, guess]
+
+
+def _guessed_side(hand: Hand) -> Note | None:
+    """A flat hand whose limits do not tell its palm's side: its fingers, but for a thumb, bend as far back as forth."""
+    stated = hand.tree if hand.description is None else hand.description.tree
+    beyond = torch.where(hand.opening_signs > 0, stated.upper - hand.open_ends, hand.open_ends - stated.lower)
+    both = (beyond >= BOTH_WAYS * (hand.closed_ends - hand.open_ends).abs()) & (beyond > FAR_BACK)
+    lasts = [int(joints.nonzero()[-1, 0]) for tip in hand.tips if bool((joints := hand.tree.moves[tip] & hand.movable).any())]
+    level = FingerMotion.of(hand).level((stated.lower + stated.upper) / 2)
+    if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
+        return None
+    return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is "
+                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:

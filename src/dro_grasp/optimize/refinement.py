@@ -77,11 +77,11 @@ def _descend(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: RefineConfig
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Steps down the gradient; each is kept where it lowers the energy, within the bounds around the start."""
-    tree = energy.hand.tree
+    hand, unit = energy.hand, energy.hand.tree.joint_unit
     start, pivot = T, energy.pivot(T)
-    unit = tree.joint_unit
-    lower = torch.maximum(tree.lower, q - config.largest_bend * unit)
-    upper = torch.minimum(tree.upper, q + config.largest_bend * unit)
+    # No farther open than the hand opens; a grasp that is beyond already goes no farther.
+    lower = torch.maximum(torch.minimum(hand.lower, q), q - config.largest_bend * unit)
+    upper = torch.minimum(torch.maximum(hand.upper, q), q + config.largest_bend * unit)
     # The pose is the start turned by `turn` about the pivot and shifted by `move`: both are bounded as they stand.
     move, turn = torch.zeros_like(pivot), torch.zeros_like(pivot)
     pace = torch.ones_like(pivot[:, :1])

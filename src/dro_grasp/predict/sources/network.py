@@ -117,7 +117,7 @@ def propose(
         distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config, watch)
         with watch("decode"), one_thread():
             links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
-            solution = distance_matrix.solve(hand, links, joints[part])
+            solution = distance_matrix.solve(hand.limited_to_use(), links, joints[part])
             found.append((solution.T_world_wrist, solution.joints, links.points))
         if progress is not None:
             progress(part.stop, num)
