@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import cvxpy
 import mujoco
@@ -58,7 +59,8 @@ def pinched(hand: Hand, force: float, lever: float = 0.05) -> Squeezes:
 def test_two_fingers_hold_by_friction_what_they_press(hand: Hand, force: float, friction: float) -> None:
     # Once it slips, the object spreads the fingers as slopes would; so it may move little here.
     give = 1.5 * friction * force * 0.05**2 / 3.0
-    config = PayloadConfig(friction=friction, torsion=0.02, masses=60, iterations=6000, remainder=3.0, edges=32, give=give, softness=1e-6)
+    config = PayloadConfig(friction=friction, torsion=0.02, masses=60, iterations=6000, remainder=3.0, edges=32, give=give,
+                           softness=1e-6)
     found = float(payloads(pinched(hand, force), torch.zeros(1), torch.zeros(1), config))
     assert found == pytest.approx(2 * friction * force / GRAVITY, rel=1.5 * friction**2 + 0.04)
 
@@ -139,7 +141,7 @@ def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.nda
     data.qpos[:] = scene.qpos(grasps.T_object_wrist, grasps.pregrasp_joints)[0]
     postures = [q[0].numpy()[scene.actuated] for q in (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)]
     data.ctrl[:] = postures[0]
-    for begin, end in zip(postures, postures[1:], strict=False):
+    for begin, end in pairwise(postures):
         for i in range(RAMP):
             data.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
             for _ in range(round(PROTOCOLS["carry"].closing_time / model.opt.timestep) // RAMP):
