@@ -314,7 +314,8 @@ def _noted(path: Path) -> dict[str, Any] | None:
 
 def _asked(job: Job) -> dict[str, Any]:
     """What determines the grasps, beside hand, object and the sizes of shards, as plain values by name."""
-    values = {COMMAND: SYNTHESIZE, "seed": job.seed} | {name: value for name, value in flat(job.config).items() if name not in FREE}
+    values = {COMMAND: SYNTHESIZE, "seed": job.seed}
+    values |= {name: value for name, value in flat(job.config).items() if name not in FREE}
     return json.loads(json.dumps(values, default=str))
 
 
