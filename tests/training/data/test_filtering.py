@@ -275,7 +275,8 @@ def test_synthesis_asks_for_several_protocols_too():
 
 
 def test_command(stored, tmp_path, capsys):
-    assert main(["dataset", "filter", str(stored), "--output", str(tmp_path / "kept"), "--json"]) == 0
+    named = ["dataset", "filter", str(stored), "--protocol", "strict", "--output", str(tmp_path / "kept"), "--json"]
+    assert main(named) == 0
     told = json.loads(capsys.readouterr().out)
     kept = GraspBatch.load(tmp_path / "kept" / "barrett.parquet")
     assert told["grasps"] == 24

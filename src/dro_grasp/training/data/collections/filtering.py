@@ -203,7 +203,7 @@ def filter_dataset(
                 progress(done, sum(sizes.values()))
         whole = [task.shard for task in tasks if (task.shard.hand, task.shard.object) not in given_up]
         _join(folder, whole)
-        return FilterReport(tuple(_kept(folder, shard) for shard in whole), given_up)
+        return FilterReport(tuple(read_kept(folder, shard) for shard in whole), given_up)
 
 
 def _require_sound(pairs: Sequence[PairGrasps]) -> None:
@@ -262,7 +262,8 @@ def _tally(path: Path) -> dict[str, Any]:
     return found
 
 
-def _kept(folder: Path, shard: Shard) -> Kept:
+def read_kept(folder: Path, shard: Shard) -> Kept:
+    """What is left of a pair, from its file's footer; GraspFileError: `filter_dataset` did not write it."""
     tally, (rows, _) = _tally(shard.path(folder)), read_footer(shard.path(folder))
     return Kept(shard.hand, shard.object, tally["grasps"], rows, tally["failures"], tally["remade"])
 

@@ -39,10 +39,6 @@ class EngineConfig(Checked):
 
     protocol: str = "strict"
     """Trial that grasps must pass."""
-    also: tuple[str, ...] = ()
-    """Protocols that grasps must pass too, in this order."""
-    resettle: bool = False
-    """Settle as `generate` does, so that grasps squeeze for the object's weight."""
     scale: float = 1.0
     """Multiplies the coordinates of all objects."""
     seconds: float | None = None
@@ -65,6 +61,10 @@ class EngineConfig(Checked):
     """Links that must touch the object after closing; with fewer, a success is a cage or luck (ours)."""
     close_fingers: bool = True
     """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
+    also: tuple[str, ...] = ()
+    """Protocols that grasps must pass too, in this order."""
+    resettle: bool = False
+    """Settle as `generate` does, so that grasps squeeze for the object's weight."""
     max_barren_rounds: int = 3
     """A pair is given up after this many rounds in a row without a valid grasp."""
     candidate_budget: int = 8192
