@@ -56,7 +56,7 @@ def kept_rows(folder: Path, labels: Path) -> tuple[list[list[str]], Counter[str]
     done = {(shard.hand, shard.object): shard for shard in find_shards(labels)}
     rows, reasons, total = [], Counter[str](), Counter[str]()
     for path in sorted(folder.glob("*.parquet")):
-        before = [pair for pair in read_collection(path) if (pair.hand, pair.object) in done]
+        before = [pair for pair in read_collection(path, only_successful=False) if (pair.hand, pair.object) in done]
         if not before:
             continue
         shards = [done[pair.hand, pair.object] for pair in before]
