@@ -24,7 +24,7 @@ from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections import filtering
 from dro_grasp.training.data.collections.bundling import make_bundle
 from dro_grasp.training.data.collections.collection import PairGrasps, read_collection
-from dro_grasp.training.data.collections.filtering import FilterConfig, filter_dataset, passing
+from dro_grasp.training.data.collections.filtering import DUPLICATE, FilterConfig, filter_dataset, passing
 from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.labels import RESTLESS
 from dro_grasp.training.data.engine.schedule import require_settings
@@ -160,6 +160,15 @@ def test_settled_labels_state_a_squeeze_and_hold_again(stored):
             number += len(passed)
         held.append(number)
     assert 0 < held[0] <= held[1]
+
+
+def test_what_comes_to_rest_in_one_place_stays_once(stored):
+    (pair,) = [pair for pair in read_collection(stored, only_successful=False) if pair.object == "can"]
+    config, hand, can = FilterConfig((changed("carry"),), resettle=True), loaded_hand("barrett"), load_object("can")
+    once, _, _ = passing(hand, can, pair.grasps, config)
+    both, failures, _ = passing(hand, can, GraspBatch.concatenate([pair.grasps, pair.grasps]), config)
+    assert len(both) == len(once) > 0
+    assert failures[DUPLICATE] >= len(once)
 
 
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(stored, tmp_path):
