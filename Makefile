@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels docs rehearse docs-pictures data labels clean
 
 setup: $(STAMP)
 
@@ -91,6 +91,9 @@ data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
 	$(BIN)/dro-grasp dataset merge out/data out/fuller --output data/grasps --per-pair 190
 	$(BIN)/dro-grasp dataset merge out/other --output data/grasps --per-pair 75
 	$(BIN)/dro-grasp dataset merge out/held_out --output data/grasps --per-pair 50
+
+labels: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
+	$(BIN)/dro-grasp dataset filter data/grasps --protocol carry --also robust --resettle --again --output out/labels
 
 clean:
 	rm -rf out build dist

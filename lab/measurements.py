@@ -14,6 +14,8 @@ from lab.published_hands import HANDS as PUBLISHED
 
 PREPARED = "out/results"
 """Folder of what commands need and make once: `PREPARATIONS`."""
+LABELS = "out/labels"
+"""Folder that `make labels` fills in hours."""
 PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The hands of the paper."""
 UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgripper", "assets/orca")
@@ -48,6 +50,7 @@ class Measurement:
     cells: Mapping[str, str] = field(repr=False)  # Commands by name
     wings: tuple[str, ...] = ("compare",)  # What it rests on beside CORE, in src/dro_grasp
     alone: bool = False  # Whether nothing may run beside it, as for times of the whole machine
+    needs: str = ""  # Folder without which it is skipped; what fills it takes too long to be run on the way
     device: str = "cpu"  # What it needs; a measurement of `cuda` is skipped where there is none
 
 
@@ -143,6 +146,9 @@ MEASUREMENTS = {
     "data": Measurement("The grasps that ship with the repository", {
         "card": "python -m lab.benchmarks.data_card --json",
         "again": "python -m lab.benchmarks.dataset data/grasps --sample 60 --json"}, wings=("compare", "training")),
+    "labels": Measurement("What `carry` and `robust` leave of these grasps, and of their diversity", {
+        "kept": f"python -m lab.benchmarks.data_card data/grasps --labels {LABELS} --json"}, wings=("compare", "training"),
+        needs=LABELS),
     "speed": Measurement("Times on the processor, nothing beside", {
         name: f"python -m lab.benchmarks.{name} {options}--json" for name, options in (
             ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", "--protocol carry "),

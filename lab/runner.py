@@ -83,6 +83,8 @@ def jobs_of(name: str, measurement: Measurement) -> Iterator[Job]:
 
 def at_hand(measurement: Measurement) -> bool:
     """Whether the machine has what the measurement needs."""
+    if measurement.needs and not (ROOT / measurement.needs).exists():
+        return False
     if measurement.device == "cpu":
         return True
     import torch
@@ -111,7 +113,7 @@ def tell_stale(chosen: Mapping[str, Measurement]) -> int:
     stale = False
     for name, measurement in chosen.items():
         reasons = [why for job in jobs_of(name, measurement) if (why := reason(job))]
-        note = "" if at_hand(measurement) else f" (needs {measurement.device})"
+        note = "" if at_hand(measurement) else f" (needs {measurement.needs or measurement.device})"
         print(f"{name}: {f'{len(reasons)} of {len(measurement.cells)} commands, {reasons[0]}' if reasons else 'fresh'}{note}")
         stale |= bool(reasons) and at_hand(measurement)
     return int(stale)

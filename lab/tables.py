@@ -297,6 +297,21 @@ def data_card(results: Results) -> str:
     return table(columns, [[row[c] for c in columns] for row in cell["rows"]])
 
 
+def labels(results: Results) -> str:
+    """What the filter keeps of the shipped grasps, and of their diversity."""
+    columns = {"hand": "hand", "grasps": "grasps", "kept": "kept", "kept [%]": "kept [%]", "made anew": "made anew",
+               "diversity": "diversity", "of kept": "of kept", "wrist": "wrist", "of kept wrist": "of kept", "joints": "joints",
+               "of kept joints": "of kept", "all six half-axes [%]": "six sides [%]", "of kept half-axes [%]": "of kept"}
+    cell = results.cell("labels", "kept")
+    return table(tuple(columns.values()), [[row[c] for c in columns] for row in cell["rows"]])
+
+
+def labels_told(results: Results) -> str:
+    """How much of the data the filter has been through."""
+    cell = results.cell("labels", "kept")
+    return f"{cell['rows'][-1]['pairs']} of {cell['pairs']}"
+
+
 def commands(results: Results) -> str:
     """Whole commands, from shell to file."""
     told = {k: v for k, v in results.cell("speed", "commands").items() if isinstance(v, float)}
@@ -419,6 +434,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "fidelity.form": fidelity,
     "fidelity.simulation": simulation,
     "data.card": data_card,
+    "data.labels": labels,
     "speed.commands": commands,
     "speed.parts": parts,
     "data.again": again,
@@ -427,6 +443,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
 VALUES: dict[str, Callable[[Results], str]] = {
     "results.machine": state,
     "gpu.told": gpu,
+    "data.labels-told": labels_told,
     "fidelity.training": training_told,
     **{f"lifts.{robot}": functools.partial(lifted, robot=robot) for robot in ROBOTS},
 }

@@ -19,7 +19,7 @@ from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.training.data.collections import checking
+from dro_grasp.training.data.collections import checking, filtering
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited
@@ -163,7 +163,8 @@ def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
     def none(*_: object, **__: object) -> None:
         raise AssertionError("a trial")
 
-    monkeypatch.setattr(checking, "simulate", none)
+    for module in (checking, filtering):
+        monkeypatch.setattr(module, "simulate", none)
     assert main(["dataset", *command.split(), str(beside_a_cloud)]) == 2
     assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 

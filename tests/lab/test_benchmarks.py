@@ -13,12 +13,16 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
+from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
-from lab.benchmarks import agreement, dexgraspbench, dexgraspbench_official
+from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
+from lab.benchmarks import agreement, data_card, dexgraspbench, dexgraspbench_official
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -123,3 +127,29 @@ def test_grasps_go_to_dexgraspbench_as_its_own_come_from_it(tmp_path: Path) -> N
     assert torch.allclose(made.T_object_wrist, closed.T_object_wrist, atol=1e-6)
     for posture in ("joints", "pregrasp_joints", "squeeze_joints"):
         assert torch.allclose(getattr(made, posture), getattr(closed, posture), atol=1e-6)
+
+
+def test_what_a_filter_keeps_is_counted_with_its_diversity(tmp_path: Path) -> None:
+    """Of two pairs one is filtered: counts and diversity, by SciPy, are of this one alone, before and after."""
+    hand, made = loaded_hand("barrett"), []
+    for name, seed in (("can", 0), ("sphere", 1)):
+        starts = palm_facing_starts(hand, load_object(name), num=6, seed=seed)
+        made.append(starts.replace(trial_success=torch.ones(6, dtype=torch.bool), protocol=("strict/1",) * 6))
+    GraspBatch.concatenate(made).save(tmp_path / "barrett.parquet")
+    rows = [1, 3, 4]
+    tally = {"input": "", "grasps": 6, "failures": {"turned": 2, "lost": 1}, "remade": 1}
+    Shard("barrett", "can", 0).save(made[0][rows].to_bytes(notes_of(Yield()) | {FILTER: tally}), tmp_path / "labels")
+    (row, total), reasons = data_card.kept_rows(tmp_path, tmp_path / "labels")
+    assert reasons == {"turned": 2, "lost": 1}
+    told = dict(zip(data_card.KEPT, row, strict=True))
+    assert [told[name] for name in ("hand", "pairs", "grasps", "kept", "made anew", "fewest")] == [
+        "barrett", "1", "6", "3", "1", "3"]
+    assert told["kept [%]"] == "50.0 [19-81]"
+    assert total[:6] == ["all", "1", "6", "3", "50.0 [19-81]", "1"]
+    for batch, names in ((made[0], ("diversity", "wrist", "joints")), (
+            made[0][rows], ("of kept", "of kept wrist", "of kept joints"))):
+        T = batch.T_object_wrist.double().numpy()
+        wrist = np.concatenate([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")], 1).std(0, ddof=1)
+        joints = batch.joints.double().numpy().std(0, ddof=1)
+        wanted = [np.concatenate([wrist, joints]).mean(), wrist.mean(), joints.mean()]
+        assert [float(told[name]) for name in names] == pytest.approx(wanted, abs=6e-4)

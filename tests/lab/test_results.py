@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,20 @@ class TestRunner:
         assert self.runs() == 1
         assert runner.read("quick")["cells"]["one"]["result"] == {"number": 1}
         assert runner.main(["--stale"]) == 0
+
+    def test_what_needs_a_folder_that_takes_hours_waits_for_it(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        needy = replace(runner.MEASUREMENTS["quick"], needs="out/labels")
+        monkeypatch.setattr(runner, "MEASUREMENTS", {"quick": needy})
+        monkeypatch.setattr(runner, "ROOT", tmp_path)
+        assert runner.main(["--stale"]) == 0
+        assert "(needs out/labels)" in capsys.readouterr().out
+        assert runner.main([]) == 0
+        assert self.runs() == 0
+        (tmp_path / "out/labels").mkdir(parents=True)
+        assert runner.at_hand(needy)
+        assert runner.main(["--stale"]) == 1
 
     def test_what_is_older_than_its_code_or_weights_is_run_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
         runner.main([])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,8 @@ class Synthesize:
     scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
     seed: int = 0  # The same seed gives the same grasps.
     protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial that grasps must pass.
+    also: tuple[ProtocolName, ...] = ()  # Further protocols that they must pass, such as robust.
+    resettle: Flag = False  # Settle as `generate` does, so that hands squeeze for the object's weight.
     idle: float = 0.6
     """Probability, 0 to 1, that a finger other than the thumb need not touch. Lower values give fuller grasps, and fewer."""
     keep_idle_fingers: Flag = False
@@ -65,7 +68,7 @@ class Synthesize:
         require_distinct(self.hand, objects)
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
-            close_fingers=not self.keep_idle_fingers,
+            also=self.also, resettle=self.resettle, close_fingers=not self.keep_idle_fingers,
             synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle)))
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
@@ -294,42 +297,46 @@ class Check(DataSets):
 
 @dataclass(frozen=True)
 class Filter(DataSets):
-    """Evaluate all grasps of a data set, and keep those that pass.
+    """Evaluate all grasps of a data set, and keep those that pass. A rerun resumes.
 
-    Example: dro-grasp dataset filter theirs.parquet --protocol robust --output kept
+    Example: dro-grasp dataset filter theirs.parquet --also robust --output kept
     """
 
-    output: Path  # Folder for the files, one per hand; created if missing.
+    output: Path  # Folder for the files, one per hand at the end; created if missing. Each pair has a file in it as it is done.
     protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial.
+    also: tuple[ProtocolName, ...] = ()  # Further protocols that grasps must pass.
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None  # Friction coefficient between hand and object.
+    resettle: Flag = False  # Settle as `generate` does before, so that hands squeeze for the object's weight.
+    again: Flag = False  # With --resettle: refine those that fail, settle them once more, keep what then passes.
     close_fingers: Flag = False  # Close idle fingers onto the object where the grasp still passes.
+    workers: int = 1  # Processes of one thread each. 1 uses all cores in the trials alone.
     json: Flag = False  # Print one JSON object instead of a table.
 
     def run(self) -> int:
-        """Evaluate, and write one file per hand."""
-        from dro_grasp.files import make_folder
-        from dro_grasp.grasps.batch import GraspBatch
+        """Evaluate, and write one file per hand; the exit code is 2 if no pair could be filtered."""
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.training.data.collections.checking import keep_passing
-        from dro_grasp.training.data.collections.collection import yield_notes
-        from dro_grasp.training.data.collections.merging import file_name
+        from dro_grasp.training.data.collections.filtering import FilterConfig, filter_dataset
 
-        rules = changed(self.protocol, friction=self.friction)
-        folder = make_folder(self.output)
-        pairs = list(self.pairs(only_successful=False))
+        rules = tuple(changed(name, friction=self.friction) for name in dict.fromkeys((self.protocol, *self.also)))
+        config = FilterConfig(rules, self.resettle, self.again, self.close_fingers)
         with progress_bar("evaluating", self.json) as progress:
-            kept = keep_passing(pairs, rules, progress, self.close_fingers)
-        for hand in dict.fromkeys(g.hand for _, g in kept):
-            own = [(pair, grasps) for pair, grasps in kept if grasps.hand == hand]
-            notes = yield_notes({pair.object: pair.made for pair, _ in own})
-            GraspBatch.concatenate([grasps for _, grasps in own]).save(folder / file_name(hand), notes)
-        rows = [[pair.hand, pair.object, len(pair.grasps), len(passed)] for pair, passed in kept]
-        total, passed = sum(row[2] for row in rows), sum(row[3] for row in rows)
-        columns = ["hand", "object", "grasps", "kept"]
+            report = filter_dataset(
+                self.pairs(only_successful=False), self.output, config, self.workers, progress, say_aside)
+        columns, total = ["hand", "object", "grasps", "kept"], sum(kept.grasps for kept in report.pairs)
+        rows, passed = [[k.hand, k.object, k.grasps, k.kept] for k in report.pairs], sum(kept.kept for kept in report.pairs)
+        label = ", ".join(each.label for each in rules)
+        reasons = sum((Counter(kept.failures) for kept in report.pairs), Counter[str]())
+        failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.given_up.items()]
         values = {
-            "output": str(folder), "protocol": rules.label, "grasps": total, "kept": passed, "pairs": records(columns, rows)}
-        print_result(self.json, values, f"protocol {rules.label}", columns, rows, f"{passed} of {total} kept, in {folder}")
-        return 0
+            "output": str(self.output), "protocol": label, "grasps": total, "kept": passed,
+            "remade": sum(kept.remade for kept in report.pairs), "reasons": dict(reasons.most_common()),
+            "pairs": records(columns, rows), "failures": failures}
+        notes = [f"  {count} left out: {reason}" for reason, count in reasons.most_common()]
+        print_result(self.json, values, f"protocol {label}", columns, rows,
+                     f"{passed} of {total} kept, in {self.output}", *notes)
+        for failure in failures:
+            say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
+        return 2 if failures and not report.pairs else 0
 
 
 @dataclass(frozen=True)

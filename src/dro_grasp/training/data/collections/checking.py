@@ -1,4 +1,4 @@
-"""Evaluate stored grasps again: do their verdicts hold, and which grasps pass another protocol?"""
+"""Evaluate stored grasps again: do their verdicts hold?"""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import PairGrasps, Sources
-from dro_grasp.training.data.engine.worker import closed_where_it_holds
 
 Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps in all)
 
@@ -81,23 +80,6 @@ def check(
     for grasps, (hand, obj) in zip(drawn, _loaded(drawn, progress), strict=True):
         result = result.extended(grasps, simulate(hand, obj, grasps, rules))
     return result
-
-
-def keep_passing(
-    pairs: Iterable[PairGrasps], rules: Protocol, progress: Progress | None = None, close_fingers: bool = False
-) -> list[tuple[PairGrasps, GraspBatch]]:
-    """Evaluate all grasps and keep those that pass, with their new results: each pair and the grasps left of it.
-
-    With `close_fingers`, idle fingers are closed as `closed_where_it_holds` does.
-    """
-    parts = [pair for pair in pairs if len(pair.grasps)]
-    kept = []
-    for pair, (hand, obj) in zip(parts, _loaded([pair.grasps for pair in parts], progress), strict=True):
-        grasps = pair.grasps.with_trial(simulate(hand, obj, pair.grasps, rules))
-        if close_fingers:
-            grasps = closed_where_it_holds(hand, obj, grasps, rules)
-        kept.append((pair, grasps[grasps.success]))
-    return kept
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:

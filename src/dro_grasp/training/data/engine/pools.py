@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     import ray
 
 
-Work = Callable[[Job, Task], FinishedShard]
+Work = Callable[[Any, Any], FinishedShard]
+"""What makes a shard of the settings that all share, a Job for `make_shard`, and a task, which has a `shard`."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Failed:
     died: bool = False  # the worker died or was stopped: a new attempt may succeed
 
 
-Outcome = tuple[Task, FinishedShard | Failed]
+Outcome = tuple[Any, FinishedShard | Failed]  # The task, and what became of it
 
 
 @runtime_checkable
@@ -69,7 +70,7 @@ def failure_of(error: BaseException) -> Failed:
     return Failed(reason.splitlines()[0][:300] if reason else type(error).__name__)
 
 
-def attempt(work: Work, job: Job, task: Task) -> FinishedShard | Failed:
+def attempt(work: Work, job: Any, task: Any) -> FinishedShard | Failed:
     """Make a shard; an error becomes a value, as it must not stop the other shards."""
     try:
         return work(job, task)
@@ -84,18 +85,18 @@ class LocalPool:
     over its shard would keep the lock from the others.
     """
 
-    def __init__(self, job: Job, workers: int, limit: float, work: Work = make_shard) -> None:
+    def __init__(self, job: Any, workers: int, limit: float, work: Work = make_shard) -> None:
         """Prepare the processes; each starts with its first shard. One that takes longer than the limit [s] is stopped."""
         self.job, self.limit, self.work = job, limit, work
         self.idle = [_one_process() for _ in range(workers)]
-        self.busy: dict[Future[FinishedShard | Failed], tuple[Task, ProcessPool]] = {}
+        self.busy: dict[Future[FinishedShard | Failed], tuple[Any, ProcessPool]] = {}
 
     @property
     def free(self) -> int:
         """Idle processes."""
         return len(self.idle)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Any) -> None:
         """Hand a shard to an idle process."""
         pool = self.idle.pop()
         try:

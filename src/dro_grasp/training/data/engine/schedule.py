@@ -269,6 +269,8 @@ class Production:
 
 
 SETTINGS = "settings.json"  # File of the settings in a data set's folder
+COMMAND = "command"  # Setting that says which command fills the folder
+SYNTHESIZE = "synthesize"  # Its value where it is not noted
 FREE = frozenset({
     "seconds", "candidates", "min_candidates", "max_candidates", "max_barren_rounds", "candidate_budget", "max_crashes",
     "shard", "shard_seconds", "synthesis.device"})
@@ -281,12 +283,18 @@ def require_settings(folder: Path, job: Job) -> None:
     The note is there before the first shard. So a folder with shards and without a note is of an earlier version: it is taken
     as it is, and gets none, as nobody knows its settings. Of several processes that begin a folder at once, one writes.
     """
-    path, asked = folder / SETTINGS, _asked(job)
+    agree(folder, _asked(job))
+
+
+def agree(folder: Path, asked: dict[str, Any]) -> None:
+    """As `require_settings`, for settings of any work, as plain values by name."""
+    path = folder / SETTINGS
     found = _noted(path)
     if found is None:
         if not find_shards(folder):
             _write_once(path, json.dumps(asked, indent=1))
         found = _noted(path) or {}
+    found = {COMMAND: SYNTHESIZE} | found
     if differing := [name for name, value in asked.items() if found.get(name, value) != value]:
         made, given = (", ".join(f"{name} {values[name]}" for name in differing) for values in (found, asked))
         raise OptionError(f"{folder} was begun with {made}, {given} was asked for; use the same to go on, or name another "
@@ -306,7 +314,8 @@ def _noted(path: Path) -> dict[str, Any] | None:
 
 def _asked(job: Job) -> dict[str, Any]:
     """What determines the grasps, beside hand, object and the sizes of shards, as plain values by name."""
-    values = {"seed": job.seed} | {name: value for name, value in flat(job.config).items() if name not in FREE}
+    values = {COMMAND: SYNTHESIZE, "seed": job.seed}
+    values |= {name: value for name, value in flat(job.config).items() if name not in FREE}
     return json.loads(json.dumps(values, default=str))
 
 

@@ -12,7 +12,7 @@ import signal
 def use_one_thread() -> None:
     """Compute in one thread from now on, in this process, and leave Ctrl-C to the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ["OMP_NUM_THREADS"] = "1"  # whatever it was: simulations count their threads by it
     import torch
 
     torch.set_num_threads(1)

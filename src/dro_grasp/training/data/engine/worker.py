@@ -24,9 +24,10 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.fingers import close_idle_fingers
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol
 from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from dro_grasp.training.data.bundle.training_file import split_of
+from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
 
 LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
@@ -60,6 +61,10 @@ class EngineConfig(Checked):
     """Links that must touch the object after closing; with fewer, a success is a cage or luck (ours)."""
     close_fingers: bool = True
     """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
+    also: tuple[str, ...] = ()
+    """Protocols that grasps must pass too, in this order."""
+    resettle: bool = False
+    """Settle as `generate` does, so that grasps squeeze for the object's weight."""
     max_barren_rounds: int = 3
     """A pair is given up after this many rounds in a row without a valid grasp."""
     candidate_budget: int = 8192
@@ -142,22 +147,34 @@ def valid_grasps(
     ranked = drawn[0 : max(1, round(config.trial_share * count))]
     grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
-    if config.settle and len(grasps):
+    if config.settle and not config.resettle and len(grasps):
         closed = settle(hand, obj, grasps, config.protocol, workers=1)
         shift = hand_shift(hand, grasps, closed)
         made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
         grasps = closed[shift < config.max_shift]
+    passed, failures = _passing(hand, obj, grasps, config)
+    new = distinct(hand, passed, earlier=earlier)
+    return passed[new], dataclasses.replace(
+        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum()))
+
+
+def _passing(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig
+) -> tuple[GraspBatch, Counter[str]]:
+    """The grasps that pass all protocols with enough contact, and why the others fail."""
+    restless = 0
+    if config.resettle and len(grasps):
+        grasps, stable = at_rest(hand, obj, grasps, config.close_fingers)
+        restless, grasps = int((~stable).sum()), grasps[stable]
     trial = simulate(hand, obj, grasps, config.protocol, workers=1)
     loose = trial.success & (trial.contacts < config.min_contact_links)
     passed = grasps.with_trial(trial)[trial.success & ~loose]
-    if config.close_fingers and len(passed):
+    if config.close_fingers and not config.resettle and len(passed):
         passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, workers=1)
-    new = distinct(hand, passed, earlier=earlier)
     failures = Counter(failure.value for failure in trial.failure if failure)
-    if loose.any():
-        failures[LOOSE] += int(loose.sum())
-    return passed[new], dataclasses.replace(
-        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum()))
+    failures += Counter({LOOSE: int(loose.sum()), RESTLESS: restless})
+    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], workers=1)
+    return passed, failures + later
 
 
 def closed_where_it_holds(
