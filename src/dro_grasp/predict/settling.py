@@ -62,6 +62,8 @@ class SettleConfig(Checked):
     """How far it may turn then [rad]."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
+    unstable_score: float = -3.0
+    """Highest score of a grasp that does not settle; a twentieth of them would hold [log-odds of holding]."""
     closing: str = "strict"
     """Physics of the first closing, which says where a grasp ends: fingers as strong as each other."""
     protocol: str = "carry"
@@ -107,7 +109,7 @@ def settle_best(
     """The better share of scored grasps, settled and scored again, in their order.
 
     The score counts what closing showed, and on an object seen in part the clearance that the opened hand leaves. A grasp that
-    does not hold still, or ends where the problem's constraints forbid, stays as it was and counts as unstable.
+    does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most `unstable_score`.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -124,6 +126,7 @@ def settle_best(
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
+    found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     return SettledBest(best, closed.replace(score=found), doubts(known, wrong, config))
