@@ -2,8 +2,8 @@
 
 The payload by trials is the largest mass at which a grasp holds under `carry` while it squeezes for that mass, found by halving
 the interval of logarithms. It is found twice, in other intervals: trials of a heavier mass may hold where those of a
-lighter one do not, and no prediction is nearer to trials than they are to each other. Grasps that a trial at the smallest mass ends, and
-those that do not settle, have no payload to compare, and are counted.
+lighter one do not, and no prediction is nearer to trials than they are to each other. Grasps that hold no mass that is
+tried have no payload to compare, and are counted.
 
     python -m lab.studies.payload --hands dclaw inspire --pairs 12 [--json]
 """

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -64,6 +65,22 @@ def test_a_plan_touches_nothing_at_ten_times_its_resolution(
     travelling = points[torch.from_numpy(stage <= STAGES.index("shape"))]
     in_object = travelling @ torch.from_numpy(T[:3, :3]).float() - torch.from_numpy(T[:3, 3]).float()
     assert float(obj.distance_field.distances(in_object)[0].min()) > 0
+
+
+def test_a_plan_has_the_forces_of_its_grasp(robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]) -> None:
+    """Which the predictor states for each grasp; here its joints tell whose they are."""
+    class Pressing(dro.GraspPredictor):
+        def run(self, *arguments: Any) -> Any:
+            made = super().run(*arguments)
+            joints = made.grasps.joints
+            return replace(made, grasps=made.grasps.replace(
+                squeeze_torque=0.01 * joints, payload=joints.abs().sum(1), squeeze_force=torch.full((len(joints),), 6.25)))
+
+    made = plan(robot, *standing, predictor=Pressing(), config=PlanConfig(num=12), seed=0)
+    joints = made.scene.joints[made.notes.chosen]
+    np.testing.assert_allclose(made.notes.squeeze_torque, 0.01 * joints, rtol=1e-5, atol=1e-8)
+    assert made.notes.payload == pytest.approx(np.abs(joints).sum(), rel=1e-5)
+    assert made.notes.squeeze_force == 6.25
 
 
 def test_the_check_above_sees_a_plan_that_goes_through_the_wall(

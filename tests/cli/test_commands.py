@@ -229,6 +229,15 @@ for words in {RUNS_TRIALS}:
     assert ["brand_new" in page for page in pages] == [True] * len(RUNS_TRIALS)
 
 
+def test_a_quick_benchmark_does_not_call_candidates_grasps(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of 16 candidates for each of two objects, four are returned."""
+    assert main(["benchmark", "--methods", "start", "--hands", "gripper3", "--objects", "can", "sphere", "--quick"]) == 0
+    title, *table = [line for line in capsys.readouterr().out.splitlines() if line]
+    names, _, row = [[cell.strip() for cell in line.split("|")] for line in table[:3]]
+    assert row[names.index("n")].split()[0] == "8"
+    assert title.startswith("16 candidates of each hand on each of 2 objects;")
+
+
 def test_foreign_and_empty_grasp_files_are_status_2(generate, tmp_path: Path, capsys) -> None:
     foreign, empty = tmp_path / "foreign.parquet", tmp_path / "empty.parquet"
     foreign.write_bytes(b"PAR1 not really")

@@ -27,7 +27,7 @@ from tests.helpers.served_studio import Listener, asked, served_studio
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "source": "auto"}
 CONSTRAINTS = {"direction": None, "table": None, "max_tilt": None, "obstacles": None, "contact_region": (), "keep_out": (),
-               "pregrasp_clearance": None}
+               "pregrasp_clearance": None, "margin": None, "max_force": None}
 
 
 def default(function: Callable[..., Any], name: str) -> Any:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dro_grasp.cli.main import main
 from dro_grasp.compare.metrics import wilson_interval
@@ -16,6 +19,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.stages import refine
@@ -61,6 +65,26 @@ def test_the_former_option_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     told, error = capsys.readouterr().err.splitlines()
     assert told == "warning: --method is called --source now, optimise is called optimiser now"
     assert "no_object" in error
+
+
+def test_what_grasps_carry_is_told(
+    generate, weights: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = GraspPredictor.run
+
+    def carrying(*arguments: Any) -> Prediction:
+        made = run(*arguments)
+        payload, force = torch.tensor([0.8, torch.nan, 0.034]), torch.tensor([6.25, 31.0, torch.nan])
+        return dataclasses.replace(made, grasps=made.grasps.replace(payload=payload, squeeze_force=force))
+
+    monkeypatch.setattr(GraspPredictor, "run", carrying)
+    report = generate("--protocol", "none")
+    assert (report["payload"], report["squeeze_force"]) == (pytest.approx([0.8, None, 0.034]), [6.25, 31.0, None])
+    assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "3", "--source",
+                 "network", "--candidates", "1", "--protocol", "none"]) == 0
+    said = capsys.readouterr().out
+    assert "they carry 0.034 to 0.8 kg, squeeze with 6.2 to 31 N" in said
+    assert "carries [kg]" in said
 
 
 def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:

@@ -89,6 +89,11 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
     assert asked["config"] == dro.PlanConfig()
 
 
+def test_efforts_that_are_unknown_are_told(planned: Planned, capsys: pytest.CaptureFixture[str]) -> None:
+    assert planned("--at", "0.5", "0.1", "--trajectory", "plan.yaml", "--efforts") == 0
+    assert "warning: the efforts of the grasp are unknown" in capsys.readouterr().err
+
+
 def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     planned: Planned, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,6 +112,7 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     (["--near", "nan", "0"], "--near is nan 0; give x and y in metres"),
     (["--planner-seconds", "nan"], "planner_seconds is nan; give a number above 0"),
     (["--planner-seconds", "inf"], "planner_seconds is inf; give a number above 0"),
+    (["--efforts"], "--efforts are written into the trajectory file; name one with --trajectory YAML"),
     (["--camera", "robot"], "has no camera; state it in the robot file, or give --camera JSON"),
 ])
 def test_what_cannot_be_planned_is_refused_before_the_work(

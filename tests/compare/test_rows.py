@@ -15,7 +15,7 @@ from dro_grasp.compare.stages import BEST, EQUAL_TIME, RANKED, RAW, REFINED, RET
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import PROVENANCE, SynthesisConfig, synthesize
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import StartSource
@@ -115,6 +115,13 @@ def test_a_stored_grasp_is_returned_once(tmp_path: Path, predictor: GraspPredict
     StartSource().propose(GraspProblem(HAND, CAN), 5, 0).save(tmp_path / "few.parquet")
     row = measured(FileSource(tmp_path / "few.parquet"), predictor, RETURNED, num=32)[RETURNED]
     assert (row.asked, row.returned, row.candidates) == (5, 5, 5)
+
+
+def test_the_optimisers_share_counts_grasps_of_every_version(tmp_path: Path, predictor: GraspPredictor) -> None:
+    made = StartSource().propose(GraspProblem(HAND, CAN), 4, 0)
+    made.replace(provenance=("dro-grasp 0.1.0, synthesis 1", PROVENANCE, "network 'multi'", "start")).save(
+        tmp_path / "stored.parquet")
+    assert measured(FileSource(tmp_path / "stored.parquet"), predictor, RAW)[RAW].optimised == 0.5
 
 
 def test_a_method_that_returns_too_many_is_refused(predictor: GraspPredictor, good: GraspBatch) -> None:

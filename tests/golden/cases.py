@@ -59,8 +59,8 @@ def outcome(result: dro.TrialResult) -> Numbers:
 def carried(name: str) -> Numbers:
     """Outcomes under `carry` of what is returned, and of what nobody refined: some hold, some do not."""
     hand, obj, predictor = dro.load_hand(name), dro.load_object("can"), dro.GraspPredictor()
-    made = dro.GraspBatch.concatenate([predictor.predict(hand, obj, num=4, seed=1, refine=refined) for refined in (True, False)])
-    return outcome(dro.simulate(hand, obj, made, "carry"))
+    made = [predictor.predict(hand, obj, num=4, seed=1, refine=refined) for refined in (True, False)]
+    return outcome(dro.simulate(hand, obj, dro.GraspBatch.concatenate(made), "carry"))
 
 
 def training() -> Numbers:

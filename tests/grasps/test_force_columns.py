@@ -1,4 +1,4 @@
-"""Payload and forces of the squeeze: columns that files keep, that files of before lack, and that poses of others make stale."""
+"""Payload and forces of the squeeze: columns that files keep, that former files lack, and that other poses make stale."""
 
 from __future__ import annotations
 

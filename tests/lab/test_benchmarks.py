@@ -18,7 +18,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.importing import read_foreign
-from lab.benchmarks import dexgraspbench, dexgraspbench_official
+from lab.benchmarks import agreement, dexgraspbench, dexgraspbench_official
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -59,6 +59,28 @@ def test_the_gain_by_pretraining_is_scipys_paired_interval() -> None:
     (alone,) = paper_form.gains(pretrained[:1], plain)
     assert f"{100 * (rates[0][0] - rates[1][0]):+.1f} points (one seed)" in alone
     assert paper_form.gains([], plain) == paper_form.gains(pretrained[:1], plain[1:]) == []
+
+
+def test_kappa_is_zero_for_a_judge_who_guesses_and_one_for_the_same_judge() -> None:
+    """Against counts: kappa is (p - e) / (1 - e), of the table of both judges."""
+    generator = torch.Generator().manual_seed(0)
+    one = torch.rand(20000, generator=generator) < 0.7
+    guess, noise = torch.rand(20000, generator=generator) < 0.7, torch.rand(20000, generator=generator) < 0.1
+    assert agreement.kappa(one, one) == 1.0
+    assert abs(agreement.kappa(one, guess)) < 0.03
+    other = one ^ noise
+    table = np.histogram2d(one.numpy().astype(int), other.numpy().astype(int), bins=2)[0] / len(one)
+    chance = float((table.sum(1) * table.sum(0)).sum())
+    assert agreement.kappa(one, other) == pytest.approx((np.trace(table) - chance) / (1 - chance))
+    assert agreement.kappa(torch.ones(4, dtype=torch.bool), torch.ones(4, dtype=torch.bool)) == 1.0
+
+
+def test_outcomes_are_compared_with_those_of_the_protocol_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    agreement.main("--hands gripper3 --objects can --num 3 --protocols carry --workers 1 --json".split())
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["setting"] for row in rows] == ["its own", *agreement.CHANGES]
+    assert (rows[0]["same"], rows[0]["kappa"]) == (3, 1.0)
+    assert all(abs(row["held"] - rows[0]["held"]) <= 3 - row["same"] for row in rows)
 
 
 @pytest.mark.slow

@@ -73,6 +73,30 @@ def test_what_was_not_measured_says_so(tmp_path: Path) -> None:
         "not measured (`make results NAMES=constraints`)")
 
 
+def test_a_figure_of_what_was_not_measured_says_so(tmp_path: Path) -> None:
+    from PIL import Image
+
+    nothing = tables.figure_data(tables.Results(tmp_path))
+    assert nothing == {}
+    tables.draw_figure(nothing, tmp_path / "figure.png")
+    with Image.open(tmp_path / "figure.png") as image:
+        assert image.text["Description"] == tables.digest({})
+
+
+def test_every_measured_rate_stands_beside_that_of_carry() -> None:
+    for name, measurement in MEASUREMENTS.items():
+        for cell, command in measurement.cells.items():
+            if command.startswith("dro-grasp benchmark"):
+                assert " --protocols carry " in f"{command} ", (name, cell)
+
+
+def test_hard_objects_are_measured_with_eight_grasps_of_each_pair() -> None:
+    for name in ("hard", "published_hard"):
+        for command in MEASUREMENTS[name].cells.values():
+            assert "--objects builtin:hard_test --num 32 --stages returned " in command  # a quarter is returned
+    assert [len(MEASUREMENTS[name].cells) for name in ("hard", "published_hard")] == [3, 12]
+
+
 def test_a_page_is_written_between_its_markers_only() -> None:
     text = "a <!-- value one -->old<!-- end --> b\n<!-- table two -->\nold\n<!-- end -->\n"
     wanted = "a <!-- value one -->1 %<!-- end --> b\n<!-- table two -->\n| x |\n<!-- end -->\n"

@@ -154,6 +154,9 @@ def test_fingers_are_counted_from_the_palm_on(hand) -> None:
 def test_captions_and_heading_tell_what_was_tried(hand, obj, grasps) -> None:
     assert [caption(grasps, i)[1] for i in range(3)] == [True, False, None]
     assert "confidence 73 %" in caption(grasps, 0)[0]
+    carrying = grasps.replace(payload=torch.tensor([0.8, torch.nan, 0.03]))
+    assert [caption(carrying, i)[0].split("   ")[-1] for i in (0, 2)] == ["carries 0.8 kg", "carries 0.03 kg"]
+    assert "carries" not in caption(carrying, 1)[0]
     assert heading(hand, obj, grasps) == "gripper3 on sphere: 3 grasps, 1 of 2 succeeded (dro/1)"
     untried = grasps.without_trial()
     assert heading(hand, obj, untried) == "gripper3 on sphere: 3 grasps"

@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.compare.methods import MethodOptions, make_method
+from dro_grasp.compare.methods import Method, MethodOptions, make_method
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
@@ -39,6 +41,12 @@ class Mine:
 
 class Mute:
     pass
+
+class Needy:
+    def __init__(self, temperature):
+        self.temperature = temperature
+
+NUMBER = 3
 """
 
 
@@ -118,6 +126,8 @@ def test_a_class_of_yours_stands_in_the_table(mine: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(("name", "told"), [
     ("sorcery", "there is no source 'sorcery'; choose auto, network"), ("no_such_module:Mine", "cannot be imported"),
     ("somebodys_module:Yours", "cannot be imported"), ("somebodys_module:Mute", "has no predict"), ("mean-grasp", "--bundle"),
+    ("somebodys_module:Needy", "cannot be made without arguments .*'temperature'.*give a class or function that takes none"),
+    ("somebodys_module:NUMBER", "cannot be made without arguments .*not callable"),
     ("network", r"GraspPredictor\(\).source\('network'\) makes it"),
 ])
 def test_what_is_no_source_is_explained(mine: Path, name: str, told: str) -> None:
@@ -147,6 +157,35 @@ def test_what_a_class_returns_is_checked() -> None:
             OwnSource("mine", Returns(wrong)).propose(problem, 2, 0)
     with pytest.raises(GraspFileError):
         OwnSource("mine", Returns(right)).propose(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)
+
+
+def test_a_class_that_needs_arguments_is_no_bug_of_the_program(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--source", "somebodys_module:Needy"]) == 2
+    said = capsys.readouterr().err
+    assert "source 'somebodys_module:Needy' cannot be made without arguments" in said
+    assert "bug" not in said
+
+
+def test_a_source_of_yours_may_descend(weights: str) -> None:
+    """Predictors turn gradients off, and what comes out carries no graph."""
+    class Descends:
+        def predict(self, hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
+            x = torch.zeros(num, requires_grad=True)
+            x = x - 0.1 * torch.autograd.grad(((x - 1) ** 2).sum(), x, create_graph=True)[0]
+            T = torch.eye(4).repeat(num, 1, 1)
+            T[:, 2, 3] = x
+            return GraspBatch.create(hand, obj, T, hand.canonical_joints(0.5).expand(num, -1).contiguous(), energy=x)
+
+    class Proposes(Descends):
+        def propose(self, problem: GraspProblem, num: int, seed: int) -> Candidates:
+            return Candidates.of(problem, self.predict(problem.hand, problem.obj, num, seed), 20)
+
+    problem = GraspProblem(toy_hand(), load_object("sphere"))
+    for kind in (Descends, Proposes):
+        method = Method(OwnSource("mine", kind()), GraspPredictor(weights))
+        found = method.propose(problem, 2, 0)
+        assert found.grasps.T_object_wrist[:, 2, 3].tolist() == pytest.approx([0.2, 0.2])
+        assert not any(column.requires_grad for column in (found.grasps.T_object_wrist, found.grasps.energy, found.points))
 
 
 def test_a_source_that_fails_is_named_with_its_error() -> None:

@@ -1,4 +1,4 @@
-"""Forces of closed hands: contacts and torques as MuJoCo states them, programs as CVXPY solves them, a ball between two fingers."""
+"""Forces of closed hands: contacts and torques as MuJoCo states them, programs as CVXPY solves them, a ball in a pinch."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ import pytest
 import torch
 
 from dro_grasp.geometry.contact_forces import friction_cone
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.simulation import payload as module
-from dro_grasp.simulation.forces import find_forces, largest_payload, weighed
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, squeezes_of
+from dro_grasp.simulation.forces import find_forces, largest_payload
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state
 from dro_grasp.simulation.payload import GRAVITY, PayloadConfig, Squeezes, generators, given_way, payloads, servo_torques
-from dro_grasp.simulation.pressure import Pressing, contact_forces
+from dro_grasp.simulation.pressure import Pressing
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.rollout import RAMP, rollouts
+from dro_grasp.simulation.rollout import RAMP
 from dro_grasp.simulation.scene import scene_of
 from tests.helpers.claw import ball, claw, power_grasp
 
@@ -53,12 +54,23 @@ def pinched(hand: Hand, force: float, lever: float = 0.05) -> Squeezes:
     return Squeezes(hand, joints, base, torch.zeros_like(joints), torch.zeros(1, 2), touch, 3.0)
 
 
-@pytest.mark.parametrize(("force", "friction"), [(4.0, 0.3), (8.0, 0.3), (4.0, 0.5)])
+@pytest.mark.parametrize(("force", "friction"), [(4.0, 0.2), (8.0, 0.2), (8.0, 0.1)])
 def test_two_fingers_hold_by_friction_what_they_press(hand: Hand, force: float, friction: float) -> None:
-    config = PayloadConfig(friction=friction, torsion=0.02, masses=40, iterations=3000, remainder=3.0, edges=32)
-    found = payloads(pinched(hand, force), torch.zeros(1), torch.zeros(1), config)
-    assert float(found) == pytest.approx(2 * friction * force / GRAVITY, rel=0.06)
-    assert float(payloads(pinched(hand, force), torch.tensor([0.019]), torch.zeros(1), config)) <= float(found)
+    # Once it slips, the object spreads the fingers as slopes would; so it may move little here.
+    give = 1.5 * friction * force * 0.05**2 / 3.0
+    config = PayloadConfig(friction=friction, torsion=0.02, masses=60, iterations=6000, remainder=3.0, edges=32, give=give, softness=1e-6)
+    found = float(payloads(pinched(hand, force), torch.zeros(1), torch.zeros(1), config))
+    assert found == pytest.approx(2 * friction * force / GRAVITY, rel=1.5 * friction**2 + 0.04)
+
+
+def test_who_touches_nothing_carries_nothing(hand: Hand) -> None:
+    chosen = pinched(hand, 5.0)
+    none = replace(chosen, contacts=replace(chosen.contacts, on=torch.zeros(1, 2)))
+    one = replace(chosen, contacts=replace(chosen.contacts, on=torch.tensor([[1.0, 0.0]])))
+    for alone in (none, one):
+        assert float(payloads(alone, torch.zeros(1), torch.zeros(1))) == 0
+    held, moved = (float(payloads(chosen, torch.tensor([shift]), torch.zeros(1))) for shift in (0.0, 0.019))
+    assert 0 < moved < held
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.4])
@@ -77,11 +89,11 @@ def test_no_forces_hold_more_than_efforts_allow_two_fingers(friction: float) -> 
 def test_the_linear_program_is_that_of_cvxpy() -> None:
     generator = np.random.default_rng(0)
     for _ in range(3):
-        inward = generator.normal(size=(6, 3))
+        inward = np.array(AXES) + 0.2 * generator.normal(size=(6, 3))
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         force = friction_cone(torch.from_numpy(inward), 0.5, 6).flatten(0, 1).numpy()
         wrench = np.concatenate([force, np.cross(np.repeat(-inward * [1.0, 0.8, 1.2], 6, 0), force)], 1).T
-        torque, effort = 0.1 * generator.normal(size=(4, 36)), np.array([0.5, 1.0, 0.2, 2.0])
+        torque, effort = 0.1 * np.abs(generator.normal(size=(4, 36))), np.array([0.5, 1.0, 0.2, 2.0])
         mass, problems = cvxpy.Variable(), []
         for axis in AXES:
             amounts = cvxpy.Variable(36, nonneg=True)
@@ -113,9 +125,15 @@ def test_what_gives_way_is_what_cvxpy_says(hand: Hand) -> None:
             assert float(turned[0, i, k]) == pytest.approx(np.linalg.norm(turn), rel=0.03, abs=5e-3)
 
 
+def light_grasp(hand: Hand, obj: ObjectModel) -> GraspBatch:
+    """A power grasp that presses with a third of the controller's squeeze, so that no servo is at its effort."""
+    grasps = complete(hand, power_grasp(hand, obj, 1), torch.zeros(3))
+    return grasps.replace(squeeze_joints=grasps.joints + 0.3 * (grasps.squeeze_joints - grasps.joints))
+
+
 def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.ndarray]]:
     """Sum of the normal forces on the object, and torques of the servos, after each half of the closing of one grasp."""
-    grasps = complete(hand, power_grasp(hand, obj, 1), torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
+    grasps = light_grasp(hand, obj)
     scene = scene_of(hand, obj, grasps, "carry")
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = scene.qpos(grasps.T_object_wrist, grasps.pregrasp_joints)[0]
@@ -134,11 +152,12 @@ def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.nda
                 total += force[0]
         torque = np.zeros(hand.tree.n_dof)
         torque[scene.actuated] = data.actuator_force
-        yield total, torque - np.array([data.qvel[model.joint(f"hand/{n}").dofadr[0]] for n in hand.tree.joint_names]) * -0.3
+        speed = np.array([data.qvel[model.joint(f"hand/{n}").dofadr[0]] for n in hand.tree.joint_names])
+        yield total, torque + PROTOCOLS["carry"].damping * speed
 
 
 def test_forces_are_those_that_mujoco_states(hand: Hand, obj: ObjectModel) -> None:
-    found = find_forces(hand, obj, power_grasp(hand, obj, 1))
+    found = find_forces(hand, obj, light_grasp(hand, obj))
     halves = list(closed_plainly(hand, obj))
     for (total, torque), contacts, torques in zip(halves, (found.grasp_contacts, found.squeeze_contacts),
                                                   (found.grasp_torque, found.squeeze_torque), strict=True):
@@ -157,24 +176,19 @@ def test_forces_of_no_grasps_are_none(hand: Hand, obj: ObjectModel) -> None:
 
 
 def test_the_weighed_payload_is_where_trials_begin_to_fail(hand: Hand, obj: ObjectModel) -> None:
-    grasps = complete(hand, power_grasp(hand, obj, 1), torch.zeros(3))
-    (part, rollout), = rollouts(scene_of(hand, obj, grasps, "carry"), hand, grasps, workers=1)
-    rollout.close()
-    joints = torch.from_numpy(rollout.poses()[0]).float()
-    chosen = squeezes_of(hand, contact_forces(rollout), joints, part.squeeze_joints, WeightConfig())
-    found = weighed(rollout, chosen, torch.ones(1), PayloadConfig())
-    assert 0.1 < float(found) < 4 / 1.45
+    grasps = light_grasp(hand, obj)
+    found = float(find_forces(hand, obj, grasps, weigh=True).payload)
 
     def gave(mass: float) -> float:
         state, _ = grasp_state(hand, with_mass(obj, mass), grasps, "carry")
         return float(state.gave[0, 0])
 
-    assert gave(0.4 * float(found)) < 0.02 < gave(2.5 * float(found))
+    assert gave(0.4 * found) < 0.02 < gave(2.5 * found)
 
 
 @pytest.mark.parametrize("limit", [1.0, 2.0])
 def test_no_link_presses_harder_than_it_may(hand: Hand, obj: ObjectModel, limit: float) -> None:
-    heavy, grasps = with_mass(obj, 0.3), complete(hand, power_grasp(hand, obj, 1), torch.zeros(3))
+    heavy, grasps = with_mass(obj, 0.3), light_grasp(hand, obj)
     freely = grasp_state(hand, heavy, grasps, "carry", config=WeightConfig(pull=0.0))[1]
     gently = grasp_state(hand, heavy, grasps, "carry", config=WeightConfig(pull=0.0, max_force=limit))[1]
     hardest = [

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
+from dro_grasp.grasps.forces import forces_in_words
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -27,6 +28,7 @@ COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "
 """Arrays of a plan file."""
 SCENE = ("points", "others", "T_world_wrist", "joints", "score")
 """Further arrays of it, what was planned for; their names begin with `scene_`."""
+TINY = 1e-12  # Square of the way from grasp to squeeze below which there is none [rad^2 or m^2] (ours)
 DIGITS = 6  # Decimals of joint values in trajectories: micrometres and microradians (ours)
 
 
@@ -53,6 +55,7 @@ class MotionPoint:
     stage: str  # One of STAGES
     arm: Float[np.ndarray, " n_arm"]  # [rad or m]
     hand: Float[np.ndarray, " n_dof"]  # [rad or m]
+    hand_effort: Float[np.ndarray, " n_dof"] | None = None  # [Nm or N]; None if the plan knows none
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,10 @@ class PlanNotes:
     T_world_wrist: list[list[float]]  # The wrist pose of the grasp [m], from which an arm with few joints may turn a little
     seed: int
     seconds: dict[str, float]  # Time spent on planning, by part [s]
+    payload: float | None = None  # What the grasp carries [kg]; None if that is unknown
+    squeeze_force: float | None = None  # Sum of the normal forces at the squeeze [N], likewise
+    squeeze_torque: tuple[float, ...] | None = None
+    """Efforts of the hand's independent joints at the squeeze [Nm or N], positive toward larger values; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,22 +119,40 @@ class MotionPlan:
         first, end = (int(np.searchsorted(self.stage, STAGES.index(stage), side)) for side in ("left", "right"))
         return slice(max(0, first - 1), end)
 
+    @property
+    def hand_effort(self) -> Float[np.ndarray, "k n_dof"] | None:
+        """Efforts of the hand's joints at the same times [Nm or N]; None if those of the squeeze are unknown.
+
+        They are zero until the hand is closed to the grasp, grow with its way from there to the squeeze, and then stay.
+        """
+        if self.notes.squeeze_torque is None:
+            return None
+        grasp = self.scene.joints[self.notes.chosen].astype(np.float64)
+        way = self.hand.position[-1] - grasp
+        share = np.clip((self.hand.position - grasp) @ way / max(float(way @ way), TINY), 0, 1)
+        share[self.stage < STAGES.index("close")] = 0
+        share[self.stage > STAGES.index("close")] = 1
+        return share[:, None] * np.array(self.notes.squeeze_torque)
+
     def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
         """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""
+        effort = self.hand_effort
+        columns = [self.arm.position, self.hand.position, *([] if effort is None else [effort])]
         count = int(np.ceil(self.seconds * rate - 1e-9))
         for time in [*(i / rate for i in range(count)), self.seconds]:
             row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
             yield MotionPoint(float(time), STAGES[int(self.stage[row])], *(
-                np.array([np.interp(time, t.time, column) for column in t.position.T]) for t in (self.arm, self.hand)))
+                np.array([np.interp(time, self.arm.time, column) for column in table.T]) for table in columns))
 
     def lines(self) -> list[str]:
         """The plan for people: what was dropped, what is done, how long it takes."""
         n = self.notes
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
+        forces = f"; it {told}" if (told := forces_in_words(n.payload, n.squeeze_force)) else ""
         return [
             grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
-            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'",
+            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'{forces}",
             f"motion of {self.seconds:.1f} s: {spans}",
             "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
         ]
@@ -161,7 +186,8 @@ class MotionPlan:
                 raise PlanError(f"{path} is a plan file of another version; plan again")
             time, stage, *rows = (file[name] for name in COLUMNS)
             scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
-            for name in ("arm_joints", "hand_joints"):
+            lists = ["arm_joints", "hand_joints", *(["squeeze_torque"] if header.get("squeeze_torque") is not None else [])]
+            for name in lists:
                 header[name] = tuple(header[name])
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
@@ -173,37 +199,60 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
     return f"{grasps} grasps: {reasons or 'none dropped'}"
 
 
-def trajectory_yaml(plan: MotionPlan) -> str:
-    """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces."""
+def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
+    """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces.
+
+    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints.
+
+    Args:
+        plan: What is written.
+        efforts: Write efforts into the hand's points, too, if they are known: for controllers with an effort interface, which
+            add them to what they command. A joint_trajectory_controller without one refuses them.
+    """
     notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in STAGES}
     messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm),
-                "hand": _message(notes.frame, notes.hand_joints, plan.hand)}
-    return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, time in s.\n"
-            f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
+                "hand": _message(notes.frame, notes.hand_joints, plan.hand, plan.hand_effort if efforts else None)}
+    told = forces_in_words(notes.payload, notes.squeeze_force)
+    if notes.squeeze_torque is not None:
+        messages["squeeze"] = {
+            "header": _header(notes.frame), "name": list(notes.hand_joints), "position": _plain(plan.hand.position[-1]),
+            "velocity": [], "effort": _plain(np.array(notes.squeeze_torque))}
+    return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, efforts in Nm or N, time in s.\n"
+            + (f"# The grasp {told}.\n" if told else "")
+            + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
 
 
 def trajectory_csv(plan: MotionPlan) -> str:
-    """One row for each sample: time, stage, and the target of every joint, arm before hand."""
-    text = io.StringIO()
+    """One row for each sample: time, stage, and the target of every joint, arm before hand, then known efforts of the hand."""
+    text, effort = io.StringIO(), plan.hand_effort
     table = csv.writer(text, lineterminator="\n")
     joints = [f"arm/{n}" for n in plan.notes.arm_joints] + [f"hand/{n}" for n in plan.notes.hand_joints]
+    columns = [plan.arm.position, plan.hand.position]
+    if effort is not None:
+        joints += [f"effort/{n}" for n in plan.notes.hand_joints]
+        columns.append(effort)
     table.writerow(["time", "stage", *joints])
     for i, time in enumerate(plan.arm.time.tolist()):
-        values = _plain(np.concatenate([plan.arm.position[i], plan.hand.position[i]]))
+        values = _plain(np.concatenate([column[i] for column in columns]))
         table.writerow([round(time, DIGITS), STAGES[int(plan.stage[i])], *values])
     return text.getvalue()
 
 
-def _message(frame: str, names: tuple[str, ...], part: Trajectory) -> dict[str, object]:
+def _message(
+    frame: str, names: tuple[str, ...], part: Trajectory, effort: Float[np.ndarray, "k n"] | None = None
+) -> dict[str, object]:
     points = []
     for i, time in enumerate(part.time.tolist()):
         second, nanosecond = divmod(round(time * 1e9), 10**9)
         points.append({
             "positions": _plain(part.position[i]), "velocities": _plain(part.velocity[i]),
-            "accelerations": _plain(part.acceleration[i]), "effort": [],
+            "accelerations": _plain(part.acceleration[i]), "effort": [] if effort is None else _plain(effort[i]),
             "time_from_start": {"sec": second, "nanosec": nanosecond}})
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
-    return {"header": header, "joint_names": list(names), "points": points}
+    return {"header": _header(frame), "joint_names": list(names), "points": points}
+
+
+def _header(frame: str) -> dict[str, object]:
+    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
 
 
 def _plain(values: Float[np.ndarray, " n"]) -> list[float]:

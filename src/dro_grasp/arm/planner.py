@@ -28,6 +28,7 @@ from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
@@ -388,9 +389,12 @@ def _described(
     clouds = [np.zeros((0, 3), np.float32), *(thing.cloud for thing in task.cell.obstacles)]
     wrists = grasps.T_object_wrist.double().numpy()
     fate = (CHOSEN if i == chosen else READY if i in ready else tries.dropped.get(i, WAITING) for i in range(len(grasps)))
+    effort = efforts_of(squeeze_efforts(grasps, robot.hand), chosen)
     notes = PlanNotes(
         robot.name, obj.name, robot.arm_joints, robot.hand_joints, "world", task.height, len(grasps), tries.counts, len(goals),
-        chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds)
+        chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds,
+        known(grasps.payload[chosen]), known(grasps.squeeze_force[chosen]),
+        None if effort is None else tuple(effort.double().tolist()))
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

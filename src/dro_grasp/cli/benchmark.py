@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dro_grasp.objects.shape import ObjectModel
 
 QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("carry", "strict")}
-"""What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
+"""What --quick measures: of 16 candidates a pair, methods return a quarter (ours)."""
 
 
 @dataclass(frozen=True)
@@ -114,23 +114,25 @@ class Benchmark:
                 "rows": [row.to_dict() for row in rows],
             })
             return 0
-        title = f"{self.num} grasps of each hand on each of {len(objects)} objects"
-        if self.weights is not None:
-            title = f"weights '{self.weights}', {title}"
-        if self.view != "whole":
-            title += f", view '{self.view}'"
-        if self.views > 1:
-            title += f", {self.views} views"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
                    "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp",
                    *rows[0].contact_quality]
-        say(title + "; success, and trials held where a grasp has several, in % of the n grasps asked for, those that a method "
-            "did not return included, with 95 % intervals; the average is the mean over hands; for each protocol fingers "
-            "in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each pair\n")
+        say(self._title(len(objects)) + "; success, and trials held where a grasp has several, in % of the n grasps asked for, "
+            "those that a method did not return included, with 95 % intervals; the average is the mean over hands; for each "
+            "protocol fingers in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each "
+            "pair\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
         return 0
+
+    def _title(self, n_objects: int) -> str:
+        title = f"{self.num} candidates of each hand on each of {n_objects} objects"
+        if self.weights is not None:
+            title = f"weights '{self.weights}', {title}"
+        if self.view != "whole":
+            title += f", view '{self.view}'"
+        return title + (f", {self.views} views" if self.views > 1 else "")
 
     def _objects(self) -> list[ObjectModel]:
         """The objects, loaded."""

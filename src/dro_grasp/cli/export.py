@@ -85,7 +85,8 @@ class Export:
         from dro_grasp.grasps.sources import hand_of, object_of, object_source
 
         stated = bool(grasps.states_closing.all())
-        needed = FORMATS[self.format].needs_hand or not stated
+        forces = bool(grasps.squeeze_torque.isfinite().any())  # which are clipped to what the hand exerts
+        needed = FORMATS[self.format].needs_hand or not stated or forces
         hand = hand_of(grasps, self.hand) if needed or self.hand is not None else None
         if hand is not None:
             grasps.require_hand(hand)

@@ -156,6 +156,7 @@ class Generate:
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
             "candidates": made.candidates, "dropped": made.dropped,
             "origin": dict(Counter(made.origin)), "origins": made.origin,
+            "payload": grasps.payload.tolist(), "squeeze_force": grasps.squeeze_force.tolist(),
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": success, "success_rate": rate if simulated else None, "interval_95": interval if simulated else None,
             "reasons": count_failures(grasps), "next": next_steps(grasps), "seconds": {},
@@ -222,6 +223,7 @@ class Generate:
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
         from dro_grasp.grasps.batch import percent
         from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
+        from dro_grasp.grasps.forces import forces_of_all, known, short
         from dro_grasp.simulation.outcome import diagnose
 
         rows = []
@@ -230,8 +232,10 @@ class Generate:
             if grasps.evaluated[i]:
                 outcome = [bool(grasps.success[i]), len(grasps.extra[CONTACT_LINKS][i]), float(grasps.penetration[i]) * 1e3,
                            grasps.extra[REASON][i]]
-            rows.append([i, origin[i], percent(float(grasps.confidence[i])), *outcome])
-        columns = ["grasp", "origin", "confidence", "success", "contacts", "penetration [mm]", "reason"]
+            forces = (None if x is None else short(x) for x in (known(grasps.payload[i]), known(grasps.squeeze_force[i])))
+            rows.append([i, origin[i], percent(float(grasps.confidence[i])), *forces, *outcome])
+        columns = ["grasp", "origin", "confidence", "carries [kg]", "squeeze [N]", "success", "contacts", "penetration [mm]",
+                   "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)
         say(seconds)
@@ -243,6 +247,8 @@ class Generate:
             say(f"{report['success']} of {self.num} grasps succeeded under protocol {report['protocol']}{found}")
             for line in diagnose(grasps):
                 say(line)
+        if told := forces_of_all(grasps):
+            say(f"they {told}")
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
                 say(f"{what}: {report[key]}")

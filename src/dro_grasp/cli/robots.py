@@ -72,17 +72,18 @@ class Plan:
     """Plan file: arm and hand over time, by stage, and what was dropped."""
     trajectory: Annotated[Path | None, optional("YAML", "not written")] = None
     """The motion as trajectory_msgs/JointTrajectory, one for the arm and one for the hand."""
+    efforts: Flag = False
+    """Write efforts into the hand's points of --trajectory, for controllers with an effort interface; others refuse them."""
     csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
     json: Flag = False  # Print one JSON object instead of text.
 
     def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
         """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
-        from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
         from dro_grasp.arm.planner import PlanConfig, plan
         from dro_grasp.arm.robot import load_robot
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
-        from dro_grasp.files import check_output, replacing
+        from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
         from dro_grasp.objects.shape import with_mass
@@ -102,6 +103,8 @@ class Plan:
         for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
             if path is not None:
                 check_output(path, ending)
+        if self.efforts and self.trajectory is None:
+            raise OptionError("--efforts are written into the trajectory file; name one with --trajectory YAML")
         robot = load_robot(self.robot)
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
@@ -118,19 +121,29 @@ class Plan:
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
-        if self.output is not None:
-            made.save(self.output)
-        for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
-            if path is not None:
-                with replacing(path, "trajectory") as temporary:
-                    temporary.write_text(text(made), encoding="utf-8")
-        written = {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
+        written = self._write(made)
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
             return 0
         for line in [*made.lines(), *(f"{what}: {path}" for what, path in written.items())]:
             say(line)
         return 0
+
+    def _write(self, made: MotionPlan) -> dict[str, str]:
+        """Write the files that were asked for; returns their paths."""
+        from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.files import replacing
+
+        if self.efforts and made.notes.squeeze_torque is None:
+            say_aside("warning: the efforts of the grasp are unknown, so the hand's points have none; close with a low limit")
+        if self.output is not None:
+            made.save(self.output)
+        texts = (self.trajectory, lambda: trajectory_yaml(made, self.efforts)), (self.csv, lambda: trajectory_csv(made))
+        for path, text in texts:
+            if path is not None:
+                with replacing(path, "trajectory") as temporary:
+                    temporary.write_text(text(), encoding="utf-8")
+        return {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
 
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
         """The object with what stands around it, and where its frame is in the world."""

@@ -15,7 +15,7 @@ import torch
 
 from dro_grasp.compare.metrics import diversity, finger_contact, mean_of_rates, mean_share, roc_area, success_rate
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimize.synthesis import PROVENANCE
+from dro_grasp.grasps.grasp_file import SYNTHESIZED
 from dro_grasp.simulation.contacts import NAMES
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
@@ -63,7 +63,7 @@ class Row:
     ranking: dict[str, float]  # Per protocol the area under the ROC curve of score against success, within each pair
     seconds: dict[str, float]  # Time of one grasp, by part [s]; where a source returns its best, with all their candidates
     candidates: float  # Grasps made for each pair, of which these are the best by score
-    optimised: float  # Share of the grasps that the optimiser made
+    optimised: float  # Share of the grasps that an optimiser made, of whatever version
     contact_quality: dict[str, float]  # Means of the analytic metrics of DexGraspBench, if they were measured
 
     def to_dict(self) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
         rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
         diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
         seconds=seconds, candidates=_mean([t.candidates for t in parts]),
-        optimised=_mean([float(maker == PROVENANCE) for t in parts for maker in t.grasps.provenance]),
+        optimised=_mean([float(SYNTHESIZED.search(maker) is not None) for t in parts for maker in t.grasps.provenance]),
         contact_quality={
             name: _mean([float(x) for t in parts for x in t.grasps.extra[name]])
             for name in NAMES if name in parts[0].grasps.extra

@@ -430,11 +430,11 @@ def sentence(grasps: Any) -> str:
         parts.append(f"{held} of {count} hold under {protocol}")
     if not grasps.evaluated.all():
         parts.append("not evaluated" if not grasps.evaluated.any() else f"{int((~grasps.evaluated).sum())} not evaluated")
-    for name in ("score", "energy"):
+    for name, unit in (("score", ""), ("energy", ""), ("payload", " kg"), ("squeeze_force", " N")):
         known = getattr(grasps, name)
         known = known[known.isfinite()]
         if len(known):
-            parts.append(f"{name} {float(known.min()):.2f} to {float(known.max()):.2f}")
+            parts.append(f"{name.replace('_', ' ')} {float(known.min()):.2f} to {float(known.max()):.2f}{unit}")
     return ", ".join(part for part in parts if part)
 
 

@@ -21,6 +21,7 @@ from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, dots, render
 from dro_grasp.grasps.batch import GraspBatch, percent
+from dro_grasp.grasps.forces import forces_in_words, known
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
@@ -221,6 +222,7 @@ def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
     confidence, energy = percent(float(grasps.confidence[index])), float(grasps.energy[index])
     numbers = "" if confidence is None else f"   confidence {confidence}"
     numbers += f"   energy {energy:.2f}" if math.isfinite(energy) else ""
+    numbers += f"   {told}" if (told := forces_in_words(known(grasps.payload[index]), None)) else ""
     return f"{index}   {words}{numbers}", outcome(grasps, index)
 
 

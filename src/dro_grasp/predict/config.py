@@ -72,18 +72,20 @@ class RetryConfig(Checked):
 
 @dataclass(frozen=True)
 class RescueConfig(Checked):
-    """How the optimiser helps where the score does not trust what there is (ours)."""
+    """What is asked again where the score does not trust what there is: whatever source proved better (ours)."""
 
-    trusted_scores: tuple[float, ...] = (1.5, 1.0, 1.0, 1.0)
-    """Log-odds of holding from which on a grasp needs no rival, in each round that the optimiser is asked."""
+    trusted_scores: tuple[float, ...] = (1.5, 1.0, 1.0, 1.0, 1.0, 1.0)
+    """Log-odds of holding from which on a grasp needs no rival, in each round."""
     per_grasp: int = 8
     """Candidates in a round for each grasp that needs rivals."""
     trusted_in_surroundings: tuple[float, ...] = (1.5, 0.5)
     """Trusted scores where there are surroundings, with which a descent takes longer."""
     per_grasp_in_surroundings: int = 4
     """Candidates in a round where there are surroundings."""
+    untried: int = 32
+    """A source that was not asked yet counts like one of whose first candidates, as many, one is trusted."""
     least_gain: float = 0.2
-    """No further round follows one that brings no trusted grasp, and raises the mean score of the best by less [log-odds]."""
+    """Where nothing is trusted yet, no further round follows one that raises the mean score of the best by less [log-odds]."""
 
     def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -175,7 +177,7 @@ class GraspPredictor:
         if first is not None:
             asked.until_enough(first)
         if rescue is not None:
-            asked.until_trusted(rescue)
+            asked.until_trusted([source for source in (rescue, first) if source is not None])
         done, shortage = asked.done, None
         if done is None or len(done.rows) < request.num:
             shortage = shortage_in_words(problem, request.num, done, alone=first is None or rescue is None)
@@ -224,11 +226,13 @@ class _Asking:
         self.config, self.n_points = predictor.config, predictor.network.config.n_hand
         self.problem, self.request, self.finishing, self.progress = problem, request, config, progress
         self.done: Finished | None = None
+        self.made = Counter[str]()  # candidates by source
         self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
 
     def ask(self, source: Source, num: int, seed: int) -> Finished:
         """Candidates of one source that it has not proposed before, finished beside those that it has."""
         made = ask(source, self.problem, num, seed, self.progress, self.n_points)
+        self.made[source.name] += len(made)
         if self.done is not None:
             made = made.beside(self.done.candidates)
         self.done = done = finish(self.problem, made, self.finishing, self.request.num, self.done)
@@ -246,7 +250,7 @@ class _Asking:
                 return
             count = min(wanted, math.ceil(retry.reserve * (wanted - admitted) * done.made / admitted))
 
-    def until_trusted(self, source: Source) -> None:
+    def until_trusted(self, sources: Sequence[Source]) -> None:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
         levels, each = self.config.rescue.rounds(self.problem.surroundings is not None)
         for seed, least_score in zip(_drawn(self.request.seed, len(levels)), levels, strict=True):
@@ -254,14 +258,22 @@ class _Asking:
             if not lacking:
                 return
             before = self.done
-            done = self.ask(source, each * lacking, seed)
+            done = self.ask(self._promising(sources, least_score), each * lacking, seed)
             if before is not None and self._is_hopeless(before, done, least_score):
                 return
 
+    def _promising(self, sources: Sequence[Source], least_score: float) -> Source:
+        """The source of whose candidates the largest share is trusted so far; the first of several."""
+        trusted, untried = Counter[str](), self.config.rescue.untried
+        if self.done is not None:
+            rows = (self.done.pool.score > least_score).nonzero()[:, 0].tolist()
+            trusted.update(self.done.candidates.origin[row] for row in rows)
+        return max(sources, key=lambda source: (trusted[source.name] + 1) / (self.made[source.name] + untried))
+
     def _is_hopeless(self, before: Finished, done: Finished, least_score: float) -> bool:
-        """Whether a round brought neither a grasp that is trusted nor a better one."""
+        """Whether nothing is trusted so far, and a round brought nothing better."""
         gained = done.best_mean - before.best_mean >= self.config.rescue.least_gain
-        return not gained and done.lacking(least_score) >= before.lacking(least_score)
+        return not gained and done.lacking(least_score) == self.request.num
 
 
 def _drawn(first: int, count: int) -> list[int]:

@@ -1,8 +1,8 @@
 """Forces of closed hands: what presses where, what joints exert, and what mass each grasp carries.
 
 Three answers to the last. What a squeezing hand holds by itself is predicted (see `payload`), or weighed in simulation,
-where the mass grows. A linear program says what the contacts as they are allow at most, with forces that suit each direction of gravity.
-Source of the program: Kerr and Roth 1986, with gravity from all sides; ours otherwise.
+where the mass grows. A linear program says what the contacts as they are allow at most, with forces that suit each direction
+of gravity. Source of the program: Kerr and Roth 1986, with gravity from all sides; ours otherwise.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def weighed(
     The hand squeezes for the mass as it grows, from a share of the guess to a multiple of it.
     """
     guess = guess.clamp(config.least * SPAN, config.most / SPAN)
-    closed, least = rollout.moment(), np.full(rollout.size, np.inf)
+    closed, least = rollout.moment(), SPAN * guess.numpy()
     for axis in FORCES:
         rollout.go_back(closed)
         held = np.ones(rollout.size, bool)

@@ -1,4 +1,4 @@
-"""What holds the object once the hand has closed: the motion that is left, the contacts, and what the weight then does. Ours."""
+"""What holds the object once the hand has closed: motion that is left, contacts, and what the weight then does. Ours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, serv
 from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
-from dro_grasp.simulation.scene import scene_of
+from dro_grasp.simulation.scene import TrialScene, scene_of
 from dro_grasp.simulation.trial import held
 
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
@@ -35,8 +35,8 @@ RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
 SMALLEST = 1e-3  # Weight of the squared forces beside the weight that they hold (ours)
 PAIRS = ("unanswered", "gave")  # Fields of two columns
 STEPS = 80  # Steps of the solver (ours)
-EASINGS = 5  # Times that a hand that presses too hard is eased, at most (ours)
-NEARLY = 0.9  # Share of the largest force that it is then eased to (ours)
+EASINGS = 6  # Times that hands close to find out how hard they may squeeze (ours)
+NEARLY = 0.9  # Share of the largest force of a link that they then use (ours)
 
 
 @dataclass(frozen=True)
@@ -75,36 +75,20 @@ def press(
     The squeeze is what holds the object still after closing, and in addition torques that press for its weight. A grasp whose
     closing is unsound, or loses the object, stays where it is. Arguments and errors are those of `simulate`.
     """
-    config, parts = config or WeightConfig(), [grasps[:0]]
-    for part, rollout in rollouts(scene_of(hand, obj, grasps, protocol), hand, grasps, workers):
+    config, scene, parts = config or WeightConfig(), scene_of(hand, obj, grasps, protocol), [grasps[:0]]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         joints, poses = held(part, rollout, sound)
         reached = torch.from_numpy(rollout.poses()[0]).to(joints)
         chosen = squeezes_of(hand, contact_forces(rollout), reached, part.squeeze_joints, config)
-        targets = _gentle(rollout, chosen, config)
+        targets = chosen.targets(torch.from_numpy(rollout.mass).to(joints)[:, None])[:, 0]
         still = torch.zeros(len(part)).to(joints)
         parts.append(part.replace(
             T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints),
             payload=payloads(chosen, still, still, config.payload)))
-    return GraspBatch.concatenate(parts)
-
-
-def _gentle(rollout: Rollout, chosen: Squeezes, config: WeightConfig) -> Float[Tensor, "n n_dof"]:
-    """Targets that press for the weight [rad or m].
-
-    Where the contacts of a link press harder than they may, the hand presses less, as often as it takes.
-    """
-    mass = torch.from_numpy(rollout.mass).to(chosen.joints)
-    targets, actuated = chosen.targets(mass[:, None])[:, 0], rollout.scene.actuated
-    for _ in range(EASINGS if math.isfinite(config.max_force) else 0):
-        rollout.press(targets.numpy()[:, actuated], config.pressing)
-        peak = torch.tensor([c.hardest_link for c in contact_forces(rollout)]).to(mass)
-        share = (NEARLY * config.max_force / peak.clamp_min(1e-9)).clamp_max(1)
-        if not bool((peak > config.max_force).any()):
-            break
-        targets = chosen.joints + torch.where(peak > config.max_force, share, 1.0)[:, None] * (targets - chosen.joints)
-    return targets
+    pressing = GraspBatch.concatenate(parts)
+    return _gentle(scene, pressing, NEARLY * config.max_force, workers) if math.isfinite(config.max_force) else pressing
 
 
 def grasp_state(
@@ -127,6 +111,27 @@ def grasp_state(
         type(many[0])(**{f.name: torch.cat([getattr(one, f.name) for one in many]) for f in fields(many[0])})
         for many in (parts, squeezes))
     return state, squeeze
+
+
+def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
+    """The grasps with squeezes as near to the grasp as it takes for no link to press harder than `most` after closing [N]."""
+    firm, low, high = grasps.squeeze_joints, torch.zeros(len(grasps)), torch.ones(len(grasps))
+
+    def eased(share: Float[Tensor, " n"]) -> GraspBatch:
+        return grasps.replace(squeeze_joints=grasps.joints + share[:, None] * (firm - grasps.joints))
+
+    share = high
+    for _ in range(EASINGS):
+        fits = []
+        for _, rollout in rollouts(scene, scene.hand, eased(share), workers):
+            rollout.close()
+            fits += [c.hardest_link <= most for c in contact_forces(rollout)]
+        fit = torch.tensor(fits, dtype=torch.bool)
+        low, high = torch.where(fit, share, low), torch.where(fit, high, share)
+        if bool((low == 1).all()):
+            break
+        share = (low + high) / 2
+    return eased(low)
 
 
 def _pulled(rollout: Rollout, closed: ObjectState, config: WeightConfig) -> Float[Tensor, "n 2"]:
@@ -182,8 +187,6 @@ class WeightConfig(Checked):
     """Stiffness of the servos [Nm/rad]; a squeeze is the torque over it."""
     pull: float = 1.0
     """Multiple of the weight that then pulls along six directions; 0 does not try."""
-    pressing: float = 0.2
-    """Time after which it counts how hard the hand presses [s]."""
     pulling: float = 0.2
     """Time of each pull [s]; what is not held falls 20 cm in it."""
     payload: PayloadConfig = field(default_factory=PayloadConfig)

@@ -51,6 +51,8 @@ class PayloadConfig(Checked):
     """Farthest that it may turn [rad]. Source: protocol `carry`."""
     remainder: float = 30.0
     """What of the load the contacts leave, moves the object as a spring of this stiffness would [N/m]."""
+    unheld: float = 0.3
+    """Largest share of the load that the contacts may leave."""
     softness: float = 2e-4
     """How far contacts give way [m/N]."""
     iterations: int = 80
@@ -79,7 +81,7 @@ class Squeezes:
         shrink alike, as others would not balance.
         """
         unit, tree = self.hand.tree.joint_unit**2 / self.stiffness, self.hand.tree
-        base, anyhow = self._eased(), self.contacts.pressure
+        base, anyhow = self.base, self.contacts.pressure
         left = (find_efforts(self.hand).limit - ((base - self.joints) / unit).abs()).clamp_min(0)
         share = (left[:, None] / (mass[..., None] * self.torques.abs()[:, None]).clamp_min(1e-9)).amin(-1)
         if math.isfinite(self.max_force):
@@ -88,13 +90,6 @@ class Squeezes:
             share = torch.minimum(share, (spare[:, None] / (mass[..., None] * added[:, None]).clamp_min(1e-9)).amin(-1))
         added_torques = mass[..., None] * share.clamp_max(1)[..., None] * self.torques[:, None]
         return (base[:, None] + added_torques * unit).clamp(tree.lower, tree.upper)
-
-    def _eased(self) -> Float[Tensor, "n n_dof"]:
-        """The base, as much weaker as `max_force` asks."""
-        if not math.isfinite(self.max_force):
-            return self.base
-        peak = by_link(self.contacts.pressure, self.contacts).amax(1)
-        return self.joints + (self.max_force / peak.clamp_min(1e-9)).clamp_max(1)[:, None] * (self.base - self.joints)
 
 
 def servo_torques(
@@ -123,6 +118,8 @@ def payloads(
     moved, turned = given_way(squeezes, masses, config)
     room = (config.give - shift).clamp_min(LEAST_ROOM * config.give), (config.turn - turn).clamp_min(LEAST_ROOM * config.turn)
     used = torch.maximum(moved.amax(-1) / room[0][:, None], turned.amax(-1) / room[1][:, None])
+    left = config.remainder * moved.amax(-1) / (GRAVITY * masses)
+    used = torch.maximum(used, left / config.unheld)
     return _crossing(masses, used)
 
 

@@ -14,12 +14,15 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
+from dro_grasp.hands.effort import find_efforts
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.problem import GraspProblem
 from tests.helpers.claw_urdf import claw, written
 from tests.helpers.weights import untrained_weights
 
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
-from dro_grasp.apps.server.answering import Answerer, ServerConfig
+from dro_grasp.apps.server.answering import Answerer, ServerConfig, sent_grasps
 from dro_grasp.apps.server.client import sent_file
 from dro_grasp.apps.server.messages import GraspAnswer, GraspCall
 
@@ -58,6 +61,20 @@ def test_answers_are_the_predictors_grasps(answerer: Answerer) -> None:
     check(scan, predictor.predict(hand, dro.scanned_object("cloud", seen, T), 1, **QUICK))
     assert scan.frame == "base"
     assert scan.grasps[0].success is None
+
+
+def test_answers_carry_forces(answerer: Answerer) -> None:
+    """Efforts no larger than the hand's, and null where something is unknown."""
+    hand, obj = dro.load_hand("gripper3"), dro.load_object("can")
+    made = answerer.predictor.run(GraspProblem(hand, obj), GraspRequest(2, 3, source="network", candidates=1, refine=False))
+    limit = find_efforts(hand).limit
+    torque = torch.stack([-3 * limit, torch.full_like(limit, torch.nan)])
+    payload, force = torch.tensor([0.8, torch.nan]), torch.tensor([torch.nan, 6.25])
+    grasps = made.grasps.replace(squeeze_torque=torque, payload=payload, squeeze_force=force)
+    first, second = (json.loads(grasp.model_dump_json()) for grasp in sent_grasps(hand, grasps, made))
+    np.testing.assert_allclose(first["squeeze_torque"], -limit)
+    assert (first["payload"], first["squeeze_force"]) == (pytest.approx(0.8), None)
+    assert (second["squeeze_torque"], second["payload"], second["squeeze_force"]) == (None, None, 6.25)
 
 
 def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> None:

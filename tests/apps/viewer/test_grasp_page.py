@@ -113,6 +113,11 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
     n = len(grasps)
     several = grasps.replace(robustness=torch.full((n,), 0.75), fingers_in_contact=torch.full((n,), 3.0))
     assert describe(several, 0).endswith("robustness 75.00 %  \nfingers in contact 3")
+    unknown = torch.full((n,), torch.nan)
+    silent = grasps.replace(payload=unknown, squeeze_force=unknown)
+    assert "carries" not in describe(silent, 0)
+    known = silent.replace(payload=torch.full((n,), 0.8), squeeze_force=torch.full((n,), 6.25))
+    assert "carries 0.8 kg, squeezes with 6.2 N" in describe(known, 0).splitlines()[-1]
 
 
 def test_narrow_windows_are_seen_from_farther_away_and_above_the_panel() -> None:

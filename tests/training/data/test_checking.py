@@ -17,7 +17,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections import checking, collection
-from dro_grasp.training.data.collections.checking import check, keep_passing
+from dro_grasp.training.data.collections.checking import check, keep_passing, stored_protocol
 from dro_grasp.training.data.collections.collection import PairGrasps, read_collection
 from dro_grasp.training.data.engine import worker
 from tests.helpers.loaded_hands import loaded_hand
@@ -51,6 +51,21 @@ def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
     grasps.replace(success=torch.ones(24, dtype=torch.bool)).save(tmp_path / "lie.parquet")
     lie = check(read_collection(tmp_path / "lie.parquet"), 1000, changed("dro"))
     assert lie.evaluated - lie.agreed == failures == lie.reasons.total()
+
+
+def test_what_the_data_state_is_what_is_checked_unless_another_protocol_is_named(stored, tmp_path, capsys):
+    grasps = GraspBatch.load(stored)
+    untried, mixed = tmp_path / "untried.parquet", tmp_path / "mixed.parquet"
+    grasps.without_trial().save(untried)
+    half = len(grasps) // 2
+    grasps.replace(protocol=("dro/1",) * half + ("strict/1",) * (len(grasps) - half)).save(mixed)
+    assert main(["dataset", "check", str(stored), "--sample", "3", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["protocol"] == "dro/1"
+    assert stored_protocol(read_collection(untried, only_successful=False)) == "carry"
+    assert main(["dataset", "check", str(mixed), "--sample", "3"]) == 2
+    assert "states outcomes under dro/1, strict/1; say which protocol to check: --protocol" in capsys.readouterr().err
+    assert main(["dataset", "check", str(mixed), "--sample", "3", "--protocol", "strict", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["protocol"] == "strict/1"
 
 
 def test_a_sample_is_a_sample_and_repeats(stored):

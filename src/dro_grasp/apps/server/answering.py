@@ -24,6 +24,7 @@ from dro_grasp.files import given_path
 from dro_grasp.frames import is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import REASON
+from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
@@ -103,7 +104,7 @@ class Answerer:
         seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
         return GraspAnswer(
             id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
-            wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(grasps, made),
+            wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(hand, grasps, made),
             candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
             notes=[*obj.notes, *filter(None, [call.told, warning])], shortage=made.shortage,
             seconds={name: round(value, 4) for name, value in seconds.items()})
@@ -203,15 +204,17 @@ def sent_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
     return T
 
 
-def sent_grasps(grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:
+def sent_grasps(hand: Hand, grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:
     """The grasps of a batch one by one."""
     rows = zip(grasps.wrist_position.tolist(), grasps.wrist_quaternion_wxyz.tolist(), grasps.joints.tolist(),
                grasps.pregrasp_joints.tolist(), grasps.squeeze_joints.tolist(), grasps.score.tolist(), made.origin, strict=True)
-    reasons = grasps.extra.get(REASON) or [None] * len(grasps)
+    reasons, efforts = grasps.extra.get(REASON) or [None] * len(grasps), squeeze_efforts(grasps, hand)
+    torques = [None if effort is None else effort.tolist() for effort in (efforts_of(efforts, i) for i in range(len(grasps)))]
     return [
         SentGrasp(
             wrist_position=tuple(position), wrist_quaternion_wxyz=tuple(quaternion), joints=joints, pregrasp_joints=pregrasp,
-            squeeze_joints=squeeze, score=score, origin=origin,
+            squeeze_joints=squeeze, squeeze_torque=torques[i], squeeze_force=known(grasps.squeeze_force[i]),
+            payload=known(grasps.payload[i]), score=score, origin=origin,
             success=bool(grasps.success[i]) if grasps.evaluated[i] else None, reason=reasons[i] or None)
         for i, (position, quaternion, joints, pregrasp, squeeze, score, origin) in enumerate(rows)
     ]

@@ -160,6 +160,12 @@ class SentGrasp(Message):
     """Joints before closing, clear of the object [rad or m]."""
     squeeze_joints: list[float]
     """Targets that press on the object [rad or m]."""
+    squeeze_torque: list[float] | None = None
+    """Efforts of the joints at the squeeze, positive toward larger values [Nm, N where a joint slides]; null if unknown."""
+    squeeze_force: float | None = None
+    """Sum of the normal forces at the squeeze [N]; null if unknown."""
+    payload: float | None = None
+    """Largest mass that the grasp carries [kg]; null if unknown."""
     score: float
     """Log-odds of holding; higher is better."""
     origin: str

@@ -21,6 +21,7 @@ from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.grasps.controller import complete
 from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 from dro_grasp.grasps.export.writers import Frame
+from dro_grasp.grasps.forces import forces_in_words, known
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
@@ -298,6 +299,8 @@ def describe(grasps: GraspBatch, index: int) -> str:
     for name, (column, factor, unit) in values.items():
         if bool(column[index].isfinite()):
             lines.append(f"{name} {float(column[index]) * factor:.2f}{unit}")
+    if told := forces_in_words(known(grasps.payload[index]), known(grasps.squeeze_force[index])):
+        lines.append(told)
     if links := (grasps.extra.get(CONTACT_LINKS) or [None] * len(grasps))[index]:
         lines.append(f"touched by {escaped(', '.join(links))}")
     if bool(grasps.fingers_in_contact[index].isfinite()):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +18,10 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.se3 import roma
+from dro_grasp.grasps import columns
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.formats import ExportJob
+from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
 from dro_grasp.grasps.sources import camera_pose, frame_of
 from dro_grasp.hands.hand import Hand
 
@@ -89,8 +90,18 @@ def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
 
 def confidence(grasps: GraspBatch, i: int) -> float | None:
     """Predicted probability that a grasp holds, as files state it; None without a score."""
-    known = float(grasps.confidence[i])
-    return None if math.isnan(known) else round(known, 6)
+    stated = known(grasps.confidence[i])
+    return None if stated is None else round(stated, 6)
+
+
+FORCES = ("Efforts in Nm, in N where a joint slides, of independent joints, for all that they move; positive toward larger "
+          "values. Payload in kg; squeeze_force: sum of normal forces in N.")
+"""What a reader has to know of forces."""
+
+
+def states_forces(grasps: GraspBatch) -> bool:
+    """Whether any force is known of any grasp."""
+    return any(bool(column.isfinite().any()) for column in (grasps.payload, grasps.squeeze_force, grasps.squeeze_torque))
 
 
 def comment(grasps: GraspBatch, frame: Frame) -> str:
@@ -99,8 +110,15 @@ def comment(grasps: GraspBatch, frame: Frame) -> str:
     return (
         f"# {''.join(c if c.isprintable() else ' ' for c in named)}\n"
         "# Metres and radians; quaternions by name or WXYZ. Joints are the independent ones; mimic joints follow them.\n"
-        "# Score: predicted log-odds that the grasp holds; confidence is its logistic function. Energy: lower is better.\n"
+        "# Score: predicted log-odds that the grasp holds; confidence is its logistic function. Energy: lower is better."
+        f"{f' {FORCES}' if states_forces(grasps) else ''}\n"
     )
+
+
+def forces(grasps: GraspBatch, i: int) -> dict[str, float]:
+    """Payload [kg] and squeeze force [N] of a grasp, as far as they are known."""
+    return {name: plain(column[i:i + 1])[0] for name in columns.CARRYING
+            if bool((column := getattr(grasps, name))[i].isfinite())}
 
 
 def plain(values: Float[Tensor, " k"]) -> list[float]:
@@ -125,23 +143,29 @@ NO_CONFIDENCE = 0.5
 and readers may rely on it."""
 
 
-def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
+def isaac_grasp(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str:
     """An isaac_grasp YAML file (version 1.0) of grasps of one object, with pregrasps.
 
-    Source: documentation of isaac_grasp files in Isaac Sim (grasp editor) and Isaac ROS.
+    Of forces the format knows nothing: `squeeze_cspace_position`, `squeeze_cspace_effort`, `payload` and `squeeze_force` are
+    further entries, which its readers hand on or skip. Source: documentation of isaac_grasp files in Isaac Sim (grasp editor)
+    and Isaac ROS.
     """
     position, quaternion = frame.place(grasps)
-    pregrasp = postures(grasps)["pregrasp"]
+    joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
     entries, unknown, names = {}, 0, grasps.joint_names
     for i in range(len(grasps)):
         w, *xyz = plain(quaternion[i])
-        known = confidence(grasps, i)
-        unknown += known is None
+        stated = confidence(grasps, i)
+        unknown += stated is None
         entries[f"grasp_{i}"] = {
-            "confidence": NO_CONFIDENCE if known is None else known, "position": plain(position[i]),
+            "confidence": NO_CONFIDENCE if stated is None else stated, "position": plain(position[i]),
             "orientation": {"w": w, "xyz": xyz}, "cspace_position": dict(zip(names, plain(grasps.joints[i]), strict=True)),
-            "pregrasp_cspace_position": dict(zip(names, plain(pregrasp[i]), strict=True)),
+            "pregrasp_cspace_position": dict(zip(names, plain(joints["pregrasp"][i]), strict=True)),
         }
+        if (effort := efforts_of(efforts, i)) is not None:
+            entries[f"grasp_{i}"] |= {"squeeze_cspace_position": dict(zip(names, plain(joints["squeeze"][i]), strict=True)),
+                                      "squeeze_cspace_effort": dict(zip(names, plain(effort), strict=True))}
+        entries[f"grasp_{i}"] |= forces(grasps, i)
     content = {"format": "isaac_grasp", "format_version": 1.0, "object_frame_link": frame.name_for(grasps),
                "gripper_frame_link": grasps.wrist_link, "grasps": entries}
     note = f"# {unknown} of {len(grasps)} grasps have no score: their confidence {NO_CONFIDENCE} stands for unknown.\n"
@@ -151,16 +175,18 @@ def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
 APPROACH = 0.10  # Wished path of the hand along its palm direction before the grasp [m] (ours)
 RETREAT = 0.10  # Wished path away from the grasp [m] (ours)
 SHORTEST = 0.02  # Least path of either [m] (ours)
+NO_LIMIT = 0.0  # `max_contact_force` that limits nothing. Source: moveit_msgs/Grasp
 
 
 def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
-    """A YAML list of moveit_msgs/Grasp, with the wrist link's pose and the fingers' postures.
+    """A YAML list of moveit_msgs/Grasp, with the wrist link's pose, the fingers' postures and the efforts of the squeeze.
 
     The hand approaches along its palm direction and retreats along z of the frame, which is up in a robot's base. A grasp
-    without a score has no `grasp_quality`. Source: moveit_msgs/Grasp of MoveIt 2.
+    without a score has no `grasp_quality`, and one without known efforts an empty `effort`. Payloads, which have no place in
+    it, stand in a comment. Source: moveit_msgs/Grasp of MoveIt 2, whose `grasp_posture` is of positions and efforts.
     """
     position, quaternion = frame.place(grasps)
-    joints = postures(grasps)
+    joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame.name_for(grasps)}
     at_wrist = {**header, "frame_id": grasps.wrist_link}
     palm = hand.palm_direction_wrist
@@ -171,20 +197,30 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
         quality = confidence(grasps, i)
         messages.append({
             "id": f"grasp_{i}", "pre_grasp_posture": _posture(grasps, at_wrist, joints["pregrasp"][i]),
-            "grasp_posture": _posture(grasps, at_wrist, joints["squeeze"][i]),
+            "grasp_posture": _posture(grasps, at_wrist, joints["squeeze"][i], efforts_of(efforts, i)),
             "grasp_pose": {"header": header, "pose": pose}, **({} if quality is None else {"grasp_quality": quality}),
             "pre_grasp_approach": _path(at_wrist, palm, APPROACH),
             "post_grasp_retreat": _path(header, torch.tensor([0.0, 0.0, 1.0]), RETREAT),
             "post_place_retreat": _path(at_wrist, -palm, RETREAT),
-            "max_contact_force": 0.0, "allowed_touch_objects": [grasps.object[i]],
+            "max_contact_force": forces(grasps, i).get("squeeze_force", NO_LIMIT), "allowed_touch_objects": [grasps.object[i]],
         })
-    return comment(grasps, frame) + yaml_text(messages)
+    return comment(grasps, frame) + _payloads(grasps) + yaml_text(messages)
 
 
-def _posture(grasps: GraspBatch, header: dict[str, Any], joints: Float[Tensor, " n_dof"]) -> dict[str, Any]:
+def _payloads(grasps: GraspBatch) -> str:
+    """A comment line with the payload of each grasp; nothing if none is known."""
+    if not bool(grasps.payload.isfinite().any()):
+        return ""
+    told = (str(forces(grasps, i).get("payload", "unknown")) for i in range(len(grasps)))
+    return f"# Payload of each grasp in kg: {', '.join(told)}\n"
+
+
+def _posture(
+    grasps: GraspBatch, header: dict[str, Any], joints: Float[Tensor, " n_dof"], effort: Float[Tensor, " n_dof"] | None = None
+) -> dict[str, Any]:
     """A trajectory_msgs/JointTrajectory of one point."""
-    point = {"positions": plain(joints), "velocities": [], "accelerations": [], "effort": [],
-             "time_from_start": {"sec": 0, "nanosec": 0}}
+    point = {"positions": plain(joints), "velocities": [], "accelerations": [],
+             "effort": [] if effort is None else plain(effort), "time_from_start": {"sec": 0, "nanosec": 0}}
     return {"header": header, "joint_names": list(grasps.joint_names), "points": [point]}
 
 
@@ -194,14 +230,17 @@ def _path(header: dict[str, Any], direction: Float[Tensor, "3"], wished: float) 
             "desired_distance": wished, "min_distance": SHORTEST}
 
 
-def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: float) -> list[dict[str, Any]]:
+def dexgraspbench(
+    grasps: GraspBatch, frame: Frame, object_path: str, scale: float, hand: Hand | None = None
+) -> list[dict[str, Any]]:
     """One dictionary per grasp, as DexGraspBench reads it from a npy file.
 
     Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the pose of the object's file in their
-    frame, WXYZ as well. Source: readme of DexGraspBench.
+    frame, WXYZ as well. `squeeze_effort`, `payload` and `squeeze_force` are entries of ours, where they are known. Source:
+    readme of DexGraspBench.
     """
     position, quaternion = frame.place(grasps)
-    joints = postures(grasps)
+    joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
     camera = camera_pose(grasps)  # the file of a camera's cloud is in the camera's frame
     T = frame.T_frame_object.double() if camera is None else frame.T_frame_object.double() @ camera.double()
     turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(roma.special_procrustes(T[:3, :3])))
@@ -213,39 +252,41 @@ def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: flo
         found.append({
             **qpos, "obj_scale": scale, "obj_pose": pose.numpy(), "obj_path": object_path, "hand": grasps.hand,
             "wrist_link": grasps.wrist_link, "joint_names": list(grasps.joint_names), "frame": frame.name_for(grasps),
-            "units": "m, rad",
+            "units": "m, rad, kg, N, Nm", **forces(grasps, i),
         })
+        if (effort := efforts_of(efforts, i)) is not None:
+            found[-1]["squeeze_effort"] = effort.double().numpy()
     return found
 
 
-def csv_table(grasps: GraspBatch, frame: Frame) -> str:
-    """One line per grasp: pose, score, energy, outcome and the joints of all postures, after comment lines."""
+def csv_table(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str:
+    """One line per grasp: pose, score, energy, outcome, forces, and joints of all postures and efforts, after comment lines."""
     position, quaternion = frame.place(grasps)
-    joints = postures(grasps)
+    joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
     text = io.StringIO()
     text.write(comment(grasps, frame))
     writer = csv.writer(text, lineterminator="\n")
-    names = [f"{posture}:{joint}" for posture in joints for joint in grasps.joint_names]
+    names = [f"{posture}:{joint}" for posture in (*joints, "effort") for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
-                     "robustness", "fingers_in_contact", *names])
+                     "robustness", "fingers_in_contact", *columns.CARRYING, *names])
     for i in range(len(grasps)):
         writer.writerow([
-            grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _known(grasps.score[i]), _known(grasps.energy[i]),
+            grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _cell(grasps.score[i]), _cell(grasps.energy[i]),
             int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
-            _known(grasps.robustness[i]), _known(grasps.fingers_in_contact[i]),
-            *(value for values in joints.values() for value in plain(values[i])),
+            *(_cell(getattr(grasps, name)[i]) for name in ("robustness", "fingers_in_contact", *columns.CARRYING)),
+            *(value for values in joints.values() for value in plain(values[i])), *map(_cell, efforts[i]),
         ])
     return text.getvalue()
 
 
-def _known(value: Float[Tensor, ""]) -> float | str:
+def _cell(value: Float[Tensor, ""]) -> float | str:
     """A number, or an empty cell where it is unknown."""
     return plain(value[None])[0] if bool(value.isfinite()) else ""
 
 
 def _dexgraspbench_files(job: ExportJob) -> list[bytes]:
     files = []
-    for entry in dexgraspbench(job.grasps, job.frame, job.object_path, job.object_scale):
+    for entry in dexgraspbench(job.grasps, job.frame, job.object_path, job.object_scale, job.hand):
         file = io.BytesIO()
         np.save(file, np.array(entry, dtype=object), allow_pickle=True)
         files.append(file.getvalue())
@@ -259,9 +300,9 @@ def _moveit_file(job: ExportJob) -> bytes:
 
 
 WRITERS: dict[str, Callable[[ExportJob], bytes | list[bytes]]] = {
-    "isaac_grasp": lambda job: isaac_grasp(job.grasps, job.frame).encode(),
+    "isaac_grasp": lambda job: isaac_grasp(job.grasps, job.frame, job.hand).encode(),
     "moveit": _moveit_file,
     "dexgraspbench": _dexgraspbench_files,
-    "csv": lambda job: csv_table(job.grasps, job.frame).encode(),
+    "csv": lambda job: csv_table(job.grasps, job.frame, job.hand).encode(),
 }
 """What makes one object's file, or one file per grasp, by the format's name."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -32,16 +33,17 @@ class OwnSource(Source):
     def propose(
         self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None
     ) -> Candidates | GraspBatch:
-        """What it proposes, `num` at most.
+        """What it proposes, `num` at most; it may use gradients, which predictors turn off.
 
         Raises:
             OptionError: It fails, or returns something else than grasps of this hand on this object.
         """
         try:
-            if callable(getattr(self.proposer, "propose", None)):
-                made = self.proposer.propose(problem, num, seed)
-            else:
-                made = self.proposer.predict(problem.hand, problem.obj, num, seed)
+            with torch.enable_grad():
+                if callable(getattr(self.proposer, "propose", None)):
+                    made = self.proposer.propose(problem, num, seed)
+                else:
+                    made = self.proposer.predict(problem.hand, problem.obj, num, seed)
         except DroGraspError:
             raise
         except Exception as error:  # the code is not ours: any fault of it is the user's to see
@@ -54,12 +56,25 @@ class OwnSource(Source):
         if set(grasps.object) - {problem.obj.name}:
             raise OptionError(f"source '{self.name}' returned grasps of {', '.join(sorted(set(grasps.object)))}, asked for was "
                               f"'{problem.obj.name}'; give GraspBatch.create the object that it was asked for")
-        return made[:num]
+        return _detached(made[:num])
 
     def knows(self, hand: Hand) -> bool:
         """What it says itself; any hand, if it says nothing."""
         says = getattr(self.proposer, "knows", None)
         return bool(says(hand)) if callable(says) else True
+
+
+Made = TypeVar("Made", Candidates, GraspBatch)
+
+
+def _detached(made: Made) -> Made:
+    """The same without the graph of a descent that made it."""
+    if isinstance(made, Candidates):
+        return dataclasses.replace(made, grasps=_detached(made.grasps), points=made.points.detach())
+    tensors = {f.name: value.detach() for f in dataclasses.fields(made)
+               if isinstance(value := getattr(made, f.name), torch.Tensor)}
+    extra = {name: value.detach() if isinstance(value, torch.Tensor) else value for name, value in made.extra.items()}
+    return made.replace(**tensors, extra=extra)
 
 
 class FileSource(Source):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.kinds import FORMER_SOURCES, present
 from dro_grasp.predict.sources.controls import MeanGrasp, MeanGraspSource, StartSource
 from dro_grasp.predict.sources.optimiser import DescentSource
@@ -70,7 +70,7 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
     if name in (AUTO, *OF_THE_PREDICTOR):
         raise OptionError(f"source '{name}' needs a network and a configuration; GraspPredictor().source('{name}') makes it")
     if name in SOURCES:
-        return _as_source(name, SOURCES[name]())
+        return _as_source(name, _made(name, SOURCES[name]))
     if name in WITH_DATA:
         if means is None:
             raise OptionError(f"{name} needs training grasps; give a bundle (--bundle PATH)")
@@ -79,9 +79,24 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
         return FileSource(Path(name))
     module, colon, attribute = name.partition(":")
     if colon:
-        return _as_source(name, _own_class(module, attribute)())
+        return _as_source(name, _made(name, _own_class(module, attribute)))
     raise OptionError(f"there is no source '{name}'; choose {', '.join((AUTO, *source_names(), *WITH_DATA))}, name a class "
                       "of your own as module:Class, or give a grasp file (.parquet)")
+
+
+def _made(name: str, factory: Callable[[], Any]) -> Any:
+    """What a factory makes.
+
+    Raises:
+        OptionError: It needs arguments, is nothing that can be called, or fails.
+    """
+    try:
+        return factory()
+    except DroGraspError:
+        raise
+    except Exception as error:  # the code is not ours: any fault of it is the user's to see
+        raise OptionError(f"source '{name}' cannot be made without arguments ({type(error).__name__}: {error}); give a class "
+                          "or function that takes none, such as one that calls yours with what it needs") from error
 
 
 def _as_source(name: str, made: Any) -> Source:

@@ -1,0 +1,112 @@
+"""What a grasp shall carry: mass, margin and largest force reach squeeze and ranking; bad values are refused by name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dro_grasp as dro
+from dro_grasp.errors import DroGraspError
+from dro_grasp.objects.shape import DENSITY, solid_of, with_mass
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import SettleConfig, lacking_payload, settle_best, settle_grasps, weight_config
+from dro_grasp.predict.stages import refine, scored
+from dro_grasp.simulation.forces import find_forces
+from dro_grasp.simulation.grasp_state import WeightConfig
+from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.scene import object_mass
+from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.toy_batches import make
+
+HAND, CAN = loaded_hand("gripper3"), dro.load_object("can")
+HELD = SettleConfig(weight=WeightConfig(pull=0.0))
+
+
+@pytest.fixture(scope="module")
+def grasps() -> dro.GraspBatch:
+    return refine(GraspProblem(HAND, CAN), synthesize(HAND, CAN, 12, 1, SynthesisConfig(batch_size=12, steps=20)))
+
+
+def test_a_mass_replaces_density_and_volume() -> None:
+    heavy, cloud = dro.load_object("can", mass=0.7), dro.load_object(CAN.cloud, keep_table=True)
+    assert heavy.mass == pytest.approx(0.7)
+    assert heavy.volume == CAN.volume
+    assert object_mass(heavy, PROTOCOLS["carry"]) == pytest.approx(0.7)
+    assert heavy.solid_sha256 != CAN.solid_sha256, "trials of the two are others"
+    assert heavy.sha256 == CAN.sha256
+    known = with_mass(cloud, 0.7)
+    assert solid_of(known).mass == GraspProblem(HAND, known).mass == pytest.approx(0.7)
+    np.testing.assert_array_equal(known.cloud, cloud.cloud)
+    assert solid_of(cloud).density == DENSITY
+
+
+@pytest.mark.parametrize(("call", "told"), [
+    (lambda: dro.load_object("can", mass=0.0), r"mass is 0.0; give kilograms, above 0"),
+    (lambda: dro.load_object("can", mass=-1.0), "mass is -1.0"),
+    (lambda: dro.load_object("can", mass=math.nan), "mass is nan"),
+    (lambda: dro.load_object("can", mass=400.0), "400 g are 0.4 kg"),
+    (lambda: dro.load_object("can", mass="0.4"), "mass is '0.4'; give a number"),
+    (lambda: Constraints(margin=-0.5), "margin is -0.5; give a multiple"),
+    (lambda: Constraints(margin=11.0), "margin is 11.0"),
+    (lambda: Constraints(margin=math.nan), "margin is nan"),
+    (lambda: Constraints(max_force=0.0), "max_force is 0.0; give newtons above 0"),
+    (lambda: Constraints(max_force=math.inf), "max_force is inf; .* leave it out"),
+    (lambda: Constraints(max_force=True), "max_force is True"),
+])
+def test_bad_values_are_refused(call: object, told: str) -> None:
+    with pytest.raises(DroGraspError, match=told):
+        call()  # type: ignore[operator]
+
+
+def test_what_is_asked_replaces_what_is_configured() -> None:
+    asked = GraspProblem(HAND, CAN, constraints=Constraints(margin=2.0, max_force=5.0))
+    found = weight_config(asked, SettleConfig())
+    assert (found.margin, found.max_force) == (2.0, 5.0)
+    usual = weight_config(GraspProblem(HAND, CAN), SettleConfig())
+    assert (usual.margin, usual.max_force) == (1.5, math.inf)
+
+
+def test_settled_grasps_state_payload_and_forces(grasps: dro.GraspBatch) -> None:
+    found, stable, _ = settle_grasps(GraspProblem(HAND, CAN), grasps, HELD)
+    assert stable.any()
+    for name in ("payload", "squeeze_force", "squeeze_torque"):
+        known = getattr(found, name).reshape(len(found), -1).isfinite().all(1)
+        assert torch.equal(known, stable), name
+    assert float(found.payload[stable].max()) > CAN.mass
+    read = find_forces(HAND, CAN, found[stable])
+    ratio = read.squeeze_force / found.squeeze_force[stable]
+    assert 0.7 < float(ratio.median()) < 1.4, "closing once more presses about as hard"
+
+
+def test_a_heavier_object_is_squeezed_harder_and_a_fragile_one_gently(grasps: dro.GraspBatch) -> None:
+    problems = [GraspProblem(HAND, obj, constraints=asked) for obj, asked in (
+        (CAN, Constraints()), (with_mass(CAN, 1.0), Constraints()), (CAN, Constraints(max_force=2.0)))]
+    found = [settle_grasps(problem, grasps, HELD) for problem in problems]
+    usual, heavy, gentle = ([made.grasps.squeeze_force[made.stable].median() for made in found])
+    assert float(gentle) < float(usual) < float(heavy)
+    hardest = [c.hardest_link for c in find_forces(HAND, CAN, found[2].grasps[found[2].stable]).squeeze_contacts]
+    assert np.quantile(hardest, 0.9) < 1.3 * 2.0
+
+
+def test_what_cannot_carry_the_mass_scores_less(grasps: dro.GraspBatch) -> None:
+    problem = GraspProblem(HAND, with_mass(CAN, 1.0))
+    known = scored(problem, grasps)
+    free, dear = (settle_best(problem, known, 12, replace(HELD, payload_worth=worth))[1] for worth in (0.0, 1.0))
+    lacks = lacking_payload(free, 1.5)
+    settled = free.payload.isfinite() & (free.score > HELD.unstable_score + 2)
+    assert bool((lacks[settled] > 0).any())
+    torch.testing.assert_close(
+        dear.score[settled], torch.maximum(free.score - lacks, dear.score)[settled], msg="by the logarithm of what lacks")
+    assert (dear.score <= free.score + 1e-6).all()
+
+
+def test_what_lacks_is_the_logarithm_of_a_factor() -> None:
+    payloads = make(4).replace(payload=torch.tensor([1.0, 0.5, 0.0, torch.nan]))
+    assert lacking_payload(payloads, 1.0).tolist() == pytest.approx([0, math.log(2), math.log(20), 0])
+    assert lacking_payload(payloads, 0.0).tolist() == [0, 0, 0, 0]
