@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from itertools import product
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.cli.output import progress_bar
 from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
 from dro_grasp.compare.stages import pair_seed
 from dro_grasp.errors import NoGraspError
@@ -65,9 +67,13 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     predictor, objects = GraspPredictor(), resolve_objects(options.objects)
-    with tempfile.TemporaryDirectory() as folder:
+    pairs = []
+    with tempfile.TemporaryDirectory() as folder, progress_bar("pairs", options.json) as progress:
         hands = hands_of(options.hands, options.made, Path(folder))
-        pairs = [returned(predictor, hand, obj, options.num, options.protocol) for hand in hands for obj in objects]
+        for hand, obj in product(hands, objects):
+            pairs.append(returned(predictor, hand, obj, options.num, options.protocol))
+            if progress is not None:
+                progress(len(pairs), len(hands) * len(objects))
     confidence, held = (torch.cat(column) for column in zip(*pairs, strict=True))
     bins = reliability(confidence, held)
     facts = {

@@ -47,8 +47,8 @@ def score(of: float, known: Evidence) -> float:
 
 
 @pytest.mark.parametrize("worse", [
-    {"speed": 0.05, "spin": 1.0, "gave": (0.1, 3.0)}, {"shift": 0.018, "turn": 0.4, "gave": (0.03, 0.5)}, {"worst": 1.2},
-    {"gave": (0.1, 3.0)}, {"payload": 0.02}, {"effort": 1.5, "payload": 0.1},
+    {"speed": 0.05, "spin": 1.0, "gave": (0.1, 3.0)}, {"shift": 0.018, "turn": 0.4, "gave": (0.03, 0.5)}, {"mass": 3.0},
+    {"gave": (0.1, 3.0)}, {"payload": 0.02}, {"depth": 0.006, "stable": False},
     {"contacts": 0.0, "links": 0.0, "pressure": 0.0, "slip": 3.0, "worst": 3.0, "gave": (0.1, 3.0)},
     {"stable": False, "moved": 0.04},
 ])
