@@ -39,6 +39,9 @@ OBJECT_FILE = "object_file"  # Further column: path of the object, if it is a us
 OBJECT_SCALE = "object_scale"  # Further column: scale of that file
 FRAME = "frame"  # Further column of grasps on a camera's cloud: name of the frame of the poses
 CAMERA = "T_frame_camera"  # Further column of such grasps: pose of the camera in that frame, row by row [m]
+TABLE = "table"
+"""Further column of grasps made for a table: upward unit normal of its plane and height along it in the object's frame [m]; NaN
+for none."""
 ENERGY_TERM = "energy_"  # How the names of further columns with the terms of the grasp energy begin
 Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the name and hash of their object
 

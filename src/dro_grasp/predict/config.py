@@ -78,9 +78,15 @@ class RescueConfig(Checked):
     """Trusted scores where there are surroundings, with which a descent takes longer."""
     per_grasp_in_surroundings: int = 4
     """Candidates in a round where there are surroundings."""
+    trusted_flat: tuple[float, ...] = (-4.0, -4.0, -4.0)
+    """Trusted scores where the object lies flat on a table: what was lifted in simulation is trusted."""
+    per_grasp_flat: int = 8
+    """Candidates in a round there, few of which are lifted."""
 
-    def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
+    def rounds(self, surrounded: bool, flat: bool = False) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""
+        if flat:
+            return self.trusted_flat, self.per_grasp_flat
         if surrounded:
             return self.trusted_in_surroundings, self.per_grasp_in_surroundings
         return self.trusted_scores, self.per_grasp

@@ -43,6 +43,8 @@ class Constraints(Checked):
     """Palm direction; any by default. Over a table, palms also tilt down as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
+    touch_table: bool = True
+    """Whether fingertips may touch the table. A thing that lies flat on it can hardly be grasped otherwise."""
     max_tilt: float | None = None
     """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
     By default palms point roughly along the direction."""
@@ -160,7 +162,7 @@ class Constraints(Checked):
         surroundings = None
         if plane is not None or obstacles is not None or keep_out is not None:
             below = None if plane is None else torch.tensor(plane, dtype=torch.float32)
-            surroundings = Surroundings(below, obstacles, keep_out)
+            surroundings = Surroundings(below, obstacles, keep_out, self.touch_table and below is not None)
         return Workspace(surroundings, Balls.of(self.contact_region))
 
 

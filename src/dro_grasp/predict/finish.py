@@ -17,7 +17,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import EasingConfig
 from dro_grasp.optimize.refinement import RefineConfig
-from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violations, feasible
+from dro_grasp.predict.admission import FALLEN, TURNED, AdmissionConfig, count_violations, feasible
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
@@ -77,7 +77,7 @@ class Finished:
     @cached_property
     def grasps(self) -> GraspBatch:
         """The best, complete and eased, as they are returned."""
-        best = self.pool[self.rows]
+        best = self.problem.on_table(self.pool[self.rows])
         return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
 
     @property
@@ -108,8 +108,10 @@ def finish(
     """
     config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
     with watch("refine"):
-        whole = complete(problem, candidates.grasps) if config.refine is None else refine(
-            problem, candidates.grasps, config.refine)
+        if config.refine is None or candidates.exact:
+            whole = complete(problem, candidates.grasps)
+        else:
+            whole = refine(problem, candidates.grasps, config.refine)
     allowed = feasible(problem, whole, config.admission)
     dropped = Counter({TURNED: candidates.turned}) + count_violations(problem, whole[~allowed], config.admission)
     candidates, made = candidates[allowed], len(candidates) + candidates.turned
@@ -117,8 +119,8 @@ def finish(
         refined = pool = scored(problem, whole[allowed], config.score)
     if config.settle is not None and can_settle(problem) and len(refined):
         with watch("settle"):
-            rows, pool = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
-        candidates = candidates[rows]
+            rows, pool, fallen = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
+        candidates, dropped = candidates[rows], dropped + Counter({FALLEN: fallen})
     seconds = watch.seconds
     if rivals is not None:
         pool = GraspBatch.concatenate([rivals.pool, pool])

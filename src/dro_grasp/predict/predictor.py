@@ -156,7 +156,7 @@ class GraspPredictor:
             NoGraspError: No grasp was found.
             OptionError: There is no such source, or it does not know the hand.
         """
-        first, rescue = self._roles(request)
+        first, rescue = self._roles(problem, request)
         for source in (first, rescue):
             if source is not None and not source.knows(problem.hand):
                 raise OptionError(f"source '{source.name}' does not know hand '{problem.hand.name}'; choose another source")
@@ -199,10 +199,12 @@ class GraspPredictor:
             return NetworkSource(self.network, config if temperature is None else replace(config, temperature=temperature))
         return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
 
-    def _roles(self, request: GraspRequest) -> tuple[Source | None, Source | None]:
+    def _roles(self, problem: GraspProblem, request: GraspRequest) -> tuple[Source | None, Source | None]:
         """The source that is asked first, and the one that makes rivals for what is not trusted."""
         named = self.source(request.source, request.temperature)
         if request.source == AUTO:
+            if problem.lies_flat:  # the network knows no table, and no hand that pinches beside one
+                return None, self.source(OptimiserSource.name)
             return named, self.source(OptimiserSource.name)
         # The optimiser alone makes as few candidates as are trusted, which takes less time than a fixed number.
         return (None, named) if isinstance(named, OptimiserSource) else (named, None)
@@ -242,7 +244,7 @@ class _Asking:
 
     def until_trusted(self, source: Source) -> None:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
-        levels, each = self.config.rescue.rounds(self.problem.surroundings is not None)
+        levels, each = self.config.rescue.rounds(self.problem.surroundings is not None, self.problem.lies_flat)
         for seed, least_score in zip(_drawn(self.request.seed, len(levels)), levels, strict=True):
             lacking = self.request.num if self.done is None else self.done.lacking(least_score)
             if not lacking:

@@ -85,8 +85,10 @@ def can_settle(problem: GraspProblem) -> bool:
 def settle_best(
     problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig | None = None,
     score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
-) -> tuple[Int[Tensor, " k"], GraspBatch]:
+) -> tuple[Int[Tensor, " k"], GraspBatch, int]:
     """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
+
+    From a table that was in the simulation, grasps that do not lift the object are left out; how many comes last.
 
     The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A
     grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
@@ -101,7 +103,8 @@ def settle_best(
         admission: What the constraints let pass.
     """
     config = config or SettleConfig()
-    count = max(round(config.share * len(grasps)), min(len(grasps), least))
+    # The score, which is learned from objects that hang in the air, does not tell which of several pinches lifts.
+    count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
     closed, stable, state = settle_grasps(problem, grasps[best], config)
     wrong = ~feasible(problem, closed, admission)
@@ -113,7 +116,11 @@ def settle_best(
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
-    return best, closed.replace(score=found)
+    closed = closed.replace(score=found)
+    if problem.table is None:
+        return best, closed, 0
+    lifted = (stable & ~wrong).index_put((stable.nonzero()[:, 0],), giving(state) < 1) & ~wrong
+    return best[lifted], closed[lifted], int((~lifted).sum())
 
 
 def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
@@ -132,18 +139,31 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
         HandError: The hand came without its description.
     """
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
-    grasps = complete(problem, grasps.without("score"))
+    grasps = problem.on_table(complete(problem, grasps.without("score")))
     closed = settle(hand, obj, grasps)
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     again, rows = near & ~still, near.nonzero()[:, 0]
-    better = replaced(closed, still, grip(problem, closed[still], config.refinement))
-    better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
+    if problem.lies_flat:
+        better = as_before(closed, grasps)[rows]
+    else:
+        better = replaced(closed, still, grip(problem, closed[still], config.refinement))
+        better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
+    better = problem.on_table(better)
     (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
     better = better.replace(squeeze_joints=squeeze)
     return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
+
+
+def as_before(closed: GraspBatch, grasps: GraspBatch) -> GraspBatch:
+    """Closed grasps that open and press by as much as the grasps that they were.
+
+    What lies flat is thinner than the distances know that refinement goes by: it would move fingers off what they found.
+    """
+    postures = {name: closed.joints + getattr(grasps, name) - grasps.joints for name in ("pregrasp_joints", "squeeze_joints")}
+    return closed.replace(**postures)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:
