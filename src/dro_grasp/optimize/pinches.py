@@ -18,7 +18,6 @@ from torch import Tensor
 from dro_grasp.devices import Rows
 from dro_grasp.geometry.se3 import apply, compose, roma, rotate
 from dro_grasp.hands.anatomy import PALM
-from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize import terms as energies

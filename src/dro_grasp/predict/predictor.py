@@ -101,7 +101,7 @@ class GraspPredictor:
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
         direction: Direction | None = None, max_tilt: float | None = None, table: float | None = None,
         obstacles: Scene | None = None, contact_region: tuple[Ball, ...] = (), keep_out: tuple[Ball, ...] = (),
-        pregrasp_clearance: float | None = None,
+        pregrasp_clearance: float | None = None, touch_table: bool | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
     ) -> GraspBatch:
         """Grasps with pregrasp, squeeze and score, the best score first; fewer, with a warning, if no more can be found.
@@ -112,7 +112,7 @@ class GraspPredictor:
             num: Grasps to return.
             seed: The same seed gives the same grasps.
             constraints: What grasps have to respect, in the object's frame. The keywords from `direction` to
-                `pregrasp_clearance` replace its fields.
+                `touch_table` replace its fields.
             direction: Palm direction; (0, 0, -1) grasps from above.
             max_tilt: Largest angle between the palm direction and `direction` [rad].
             table: Height of a table [m]; the hand stays above it.
@@ -120,6 +120,7 @@ class GraspPredictor:
             contact_region: Balls (x, y, z, radius) in which the hand may touch the object [m].
             keep_out: Balls (x, y, z, radius) that the hand stays out of [m].
             pregrasp_clearance: Least distance in pregrasp between the object and every link that closes [m].
+            touch_table: Whether fingertips may touch the table; None lets them beside what lies flat.
             candidates: Candidates for each grasp; the best by score are returned.
             refine: Refine and settle the candidates before they are ranked.
             temperature: Spread of z: 0 for the likeliest grasps, 1 for the diversity of the training grasps; None takes the
@@ -132,7 +133,7 @@ class GraspPredictor:
             OptionError: An argument is out of range, or the table is above the object.
         """
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
-                 "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance}
+                 "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance, "touch_table": touch_table}
         wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None and x != ()})
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:

@@ -18,9 +18,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.optimize.grasp_energy import Clearance, EnergyConfig, GraspEnergy, Surroundings, Workspace
 from dro_grasp.optimize.starts import APPROACH
-from dro_grasp.predict.constraints import Constraints
-
-LOW = 0.035  # Height on a table up to which a thing is pinched from above, rather than clasped [m] (ours)
+from dro_grasp.predict.constraints import Constraints, lies_low
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +65,9 @@ class GraspProblem:
 
     @cached_property
     def lies_flat(self) -> bool:
-        """Whether the object lies low on a table, so that fingertips have to come down to the table beside it."""
-        return self.table is not None and float((torch.from_numpy(self.obj.cloud) @ self.table[:3]).max() - self.table[3]) < LOW
+        """Whether the object lies low on a table that fingertips may touch."""
+        around = self.surroundings
+        return self.table is not None and around is not None and around.touch_plane and lies_low(self.obj, self.table)
 
     def on_table(self, grasps: GraspBatch) -> GraspBatch:
         """The grasps with the table that is there while the hand closes, in simulation too; as they are without one."""

@@ -53,6 +53,9 @@ class SettleConfig(Checked):
     """Physics of the second closing, and of the pulls after it."""
     giving_worth: float = 3.0
     """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
+    lifted: float = 0.35
+    """What lies flat on a table is lifted if the weight then moves or turns it by no larger share of what it may: pulls in a
+    trial last three times as long as those here."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
@@ -88,7 +91,7 @@ def settle_best(
 ) -> tuple[Int[Tensor, " k"], GraspBatch, int]:
     """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    From a table that was in the simulation, grasps that do not lift the object are left out; how many comes last.
+    Of what lies flat on a table, grasps that do not lift it are left out; how many comes last.
 
     The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A
     grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
@@ -117,9 +120,9 @@ def settle_best(
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     closed = closed.replace(score=found)
-    if problem.table is None:
+    if not problem.lies_flat:
         return best, closed, 0
-    lifted = (stable & ~wrong).index_put((stable.nonzero()[:, 0],), giving(state) < 1) & ~wrong
+    lifted = stable.index_put((stable.nonzero()[:, 0],), giving(state) < config.lifted) & ~wrong
     return best[lifted], closed[lifted], int((~lifted).sum())
 
 

@@ -69,7 +69,8 @@ class OptimiserSource(Source):
 def pinch(problem: GraspProblem, num: int, seed: int, config: OptimiserConfig) -> GraspBatch:
     """The best of several pinches for each that is wanted; none where no two sides of the object are opposed."""
     generator, wanted, table = torch.Generator().manual_seed(seed), problem.constraints, problem.table
-    assert table is not None and config.pinch is not None
+    assert table is not None
+    assert config.pinch is not None
     energy = problem.energy(config.synthesis.energy)
     search = PinchSearch(energy, problem.mass, wanted.direction, wanted.max_tilt, config.pinch)
     pairs = opposed_pairs(problem.obj, table, search.widest(generator), config.pinch.pairs * num, config.pinch,
