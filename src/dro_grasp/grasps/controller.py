@@ -36,7 +36,8 @@ def pregrasp_and_squeeze(
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
     """Joint values q_outer and q_inner of each grasp [rad or m].
 
-    Each finger joint moves away from the object's centre, or another of each grasp [m], and towards it. The derivative of the mean distance between
+    Each finger joint moves away from the object's centre, or another of each grasp [m], and towards it. The derivative of
+    the mean distance between
     the downstream points and the centre gives the direction, for each grasp and joint. Joints that only spread the fingers,
     joints above the palm and the wrist stay.
     """

@@ -53,7 +53,7 @@ class Surroundings:
     def distances(
         self, points: Float[Tensor, "*b 3"], leave: Float[Tensor, "*#b"] | None = None
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Signed distance [m] and its gradient, as of a `DistanceField`; points count as this much farther from the plane [m]."""
+        """Signed distance [m] and its gradient, as of a `DistanceField`; points count as `leave` farther from the plane [m]."""
         distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
         if self.plane is not None:
             distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)

@@ -203,7 +203,9 @@ class PinchSearch:
         self.config = config or PinchConfig()
         self.energy, self.hand, self.mass = energy, energy.hand, mass
         self.tilt = self.config.tilt if max_tilt is None else max_tilt
-        self.wanted = None if direction is None else torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
+        self.wanted = None
+        if direction is not None:
+            self.wanted = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
         link = energy.body.members.argmax(-1)
         assert energy.workspace.surroundings is not None
         self.surroundings = energy.workspace.surroundings
@@ -332,7 +334,8 @@ class PinchSearch:
         """What speaks against each hand."""
         config, energy, hand = self.config, self.energy, self.hand
         T, poses, fit = self._placed(hands, pairs)
-        cost = pairs.lever / config.lever / 2 + config.facing * fit[:, 1] + (fit[:, 0] - pairs.width - config.gap).abs() / config.misfit
+        misfit = (fit[:, 0] - pairs.width - config.gap).abs()
+        cost = pairs.lever / config.lever / 2 + config.facing * fit[:, 1] + misfit / config.misfit
         body = energy.body.place(poses)
         above = self.surroundings.distances(body)[0] - self.clear
         cost = cost + config.table * (-above.amin(-1)).clamp_min(0) / config.misfit

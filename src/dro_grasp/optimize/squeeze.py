@@ -91,7 +91,7 @@ def _targets(
 
 
 def _middle(energy: GraspEnergy, near: NearestPoints, touches: Bool[Tensor, "n l"]) -> Float[Tensor, "n 1 3"]:
-    """What fingers close around [m]: the object, or on a table, where they pinch any part of it, the middle of their contacts."""
+    """What fingers close around [m]: the object; on a table, where they pinch a part of it, their contacts' middle."""
     around = energy.workspace.surroundings
     if around is None or not around.touch_plane:
         return energy.centre.expand(len(touches), 1, 3)

@@ -133,7 +133,8 @@ class GraspPredictor:
             OptionError: An argument is out of range, or the table is above the object.
         """
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
-                 "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance, "touch_table": touch_table}
+                 "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance,
+                 "touch_table": touch_table}
         wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None and x != ()})
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:

@@ -153,7 +153,8 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
         better = replaced(closed, still, grip(problem, closed[still], config.refinement))
         better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
     better = problem.on_table(better)
-    (state, squeeze), depth = grasp_state(hand, obj, better, config.protocol, config=config.weight), deepest_penetration(hand, obj, better)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=config.weight)
+    depth = deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
     better = better.replace(squeeze_joints=squeeze)

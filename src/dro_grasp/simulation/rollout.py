@@ -19,7 +19,7 @@ from dro_grasp.devices import Rows, cores
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import TABLE
+from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -225,7 +225,10 @@ class Rollout:
     def _lay(self, grasps: GraspBatch) -> None:
         """Put each table where the object lies on it, and the object's weight on the table."""
         # An object that stands elsewhere than the hand expects takes the table along.
-        planes, T = grasps.extra[TABLE].double().numpy(), grasps.T_object_wrist.double().numpy()
+        found = table_planes(grasps)
+        if found is None:
+            return
+        planes, T = found.double().numpy(), grasps.T_object_wrist.double().numpy()
         laid = np.flatnonzero(np.isfinite(planes).all(1))
         up, level, rotation = planes[laid, :3], planes[laid, 3], T[laid, :3, :3]
         lowest = lowest_points(self.scene.obj, up)

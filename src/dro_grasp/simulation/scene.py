@@ -18,7 +18,7 @@ from torch import Tensor
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import TABLE
+from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.effort import find_efforts
@@ -213,8 +213,7 @@ def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | P
     """The scene in which the grasps are simulated; errors are those of `simulate`."""
     require_pair(hand, obj)
     grasps.require_hand(hand)
-    planes = grasps.extra.get(TABLE)
-    return cached_scene(hand, obj, find_protocol(protocol), planes is not None and bool(planes.isfinite().any()))
+    return cached_scene(hand, obj, find_protocol(protocol), table_planes(grasps) is not None)
 
 
 def require_simulable(hand: Hand, obj: ObjectModel) -> None:
@@ -279,7 +278,7 @@ def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name:
 
 def _add_table(scene: mujoco.MjSpec, protocol: Protocol) -> None:
     """A plane that each trial places for itself. The object rubs on it, and the hand slides, as it does on itself."""
-    body = scene.worldbody.add_body(name=TABLE, mocap=True, pos=TABLE_AWAY)
+    body = scene.worldbody.add_body(name="table", mocap=True, pos=TABLE_AWAY)
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], condim=1, mass=0.0,
                   friction=[protocol.friction, protocol.torsional_friction, 1e-4])
 
