@@ -120,7 +120,7 @@ def test_settled_grasps_hardly_push_the_object_away(many: GraspBatch, outcome: S
 def test_only_the_better_share_is_settled_and_what_is_not_held_scores_low(grasps: GraspBatch) -> None:
     never = SettleConfig(deepest=-1.0)  # every hand is deeper
     known = scored(PROBLEM, grasps).replace(score=torch.tensor([0.0, 3.0, 1.0, 2.0, -1.0]))
-    rows, found = settle_best(PROBLEM, known, 1, never)
+    rows, found, _ = settle_best(PROBLEM, known, 1, never)
     assert rows.tolist() == [1, 3]
     assert found.score.amax() <= never.unstable_score
     torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
@@ -133,10 +133,10 @@ def test_only_the_better_share_is_settled_and_what_is_not_held_scores_low(grasps
 def test_what_ends_where_constraints_forbid_stays_as_it_was_and_scores_low(many: GraspBatch, outcome: Settled) -> None:
     """A ball to spare where one of the wrists is."""
     known = scored(PROBLEM, many)
-    _, free = settle_best(PROBLEM, known, 24)
+    _, free, _ = settle_best(PROBLEM, known, 24)
     ball = (*many.T_object_wrist[outcome.stable][0, :3, 3].tolist(), 0.01)
     forbidden = GraspProblem(HAND, CAN, constraints=Constraints(keep_out=(ball,)))
-    rows, found = settle_best(forbidden, known, 24)
+    rows, found, _ = settle_best(forbidden, known, 24)
     assert rows.tolist() == list(range(24))
     barred = ~feasible(forbidden, settle_grasps(forbidden, known).grasps)
     assert bool((barred & outcome.stable).any())
@@ -156,7 +156,7 @@ def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(gr
     lacking = missing_clearance(problem.energy(EnergyConfig()), guessed, half.seen)
     assert float(lacking.max()) > 0.002
     torch.testing.assert_close(whole.score - guessed.score, stays.clearance_worth * lacking)
-    _, dear = settle_best(problem, scored(problem, grasps), 5, replace(stays, clearance_worth=200.0))
+    _, dear, _ = settle_best(problem, scored(problem, grasps), 5, replace(stays, clearance_worth=200.0))
     torch.testing.assert_close(whole.score - dear.score, 200.0 * lacking)
 
 

@@ -7,7 +7,7 @@ the object, so this is no trial; it needs the hand's description. Balls stand fo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -53,9 +53,10 @@ class SettleConfig(Checked):
     """Physics of the second closing, and of the pulls after it."""
     giving_worth: float = 3.0
     """What the score loses where the weight moves or turns the object as far as it may [log-odds]."""
-    lifted: float = 0.35
-    """What lies flat on a table is lifted if the weight then moves or turns it by no larger share of what it may: pulls in a
-    trial last three times as long as those here."""
+    lifted: float = 0.6
+    """What lies flat on a table is lifted if the weight then moves or turns it by no larger share of what it may."""
+    lifting: float = 1.0
+    """Time of each pull on it [s], as in a trial: pinches turn slowly."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
@@ -153,7 +154,8 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
         better = replaced(closed, still, grip(problem, closed[still], config.refinement))
         better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
     better = problem.on_table(better)
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=config.weight)
+    weight = replace(config.weight, pulling=config.lifting) if problem.lies_flat else config.weight
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=weight)
     depth = deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
