@@ -149,7 +149,7 @@ def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(gr
     cloud = partial_view(CAN, "cloud", 0)
     half = dataclasses.replace(cloud, seen=cloud.cloud[cloud.cloud[:, 0] > 0])
     stays = SettleConfig(lost=0.0, unstable_score=math.inf)
-    (_, whole), (_, guessed) = (
+    (_, whole, _), (_, guessed, _) = (
         settle_best(p, scored(p, grasps), 5, stays) for p in (GraspProblem(HAND, o) for o in (cloud, half)))
     torch.testing.assert_close(whole.joints, guessed.joints)
     problem = GraspProblem(HAND, half)
