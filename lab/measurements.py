@@ -20,6 +20,8 @@ PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowh
 """The hands of the paper."""
 UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgripper", "assets/orca")
 """Hands that no weights were trained on."""
+FLAT_HANDS = ("assets/leaphand", "assets/shadowhand", "gripper3")
+"""Hands that pick flat things from a table."""
 OBJECTS = {"validate": "assets:validate", "test": "builtin:test"}
 """Objects that no weights were trained on: the paper's, by which the form of the network was once chosen, and built-in ones."""
 HARD = "builtin:hard_test"
@@ -131,6 +133,9 @@ MEASUREMENTS = {
     "tables": Measurement("Objects that rest on a table, from above and from the side", {
         hand: f"python -m lab.benchmarks.tabletop --hands {hand} --objects builtin:test --num 8 --trials carry --json"
         for hand in ("allegro", "barrett")}),
+    "flat": Measurement("Flat and thin things on a table, from above, carried", {
+        _short(hand): f"python -m lab.benchmarks.tabletop --hands {hand} --objects ballpoint_pen bank_card dinner_plate "
+        "table_fork hardcover_book scissors --num 8 --sides above --trials --protocol carry --json" for hand in FLAT_HANDS}),
     "methods": Measurement("Methods of others, written anew here, beside ours", {
         f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages raw returned "
                                                 f"--protocols {FAST} dro")

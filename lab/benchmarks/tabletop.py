@@ -18,6 +18,7 @@ import torch
 import trimesh
 from jaxtyping import Float
 
+from dro_grasp.errors import NoGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -52,9 +53,9 @@ class Row:
     """Until they are returned [s]; hand, object and its distance grid are loaded before."""
     cpu: float
     """Processor time of the same [s]."""
-    clearance: float
+    clearance: float | None
     """Height of the lowest vertex of a hand over the table [m]."""
-    tilt: float
+    tilt: float | None
     """Median angle between palm and wanted direction [rad]."""
     held: int | None
     """Grasps that held in their trial."""
@@ -94,7 +95,11 @@ def measure(
     problem = GraspProblem(hand, obj, constraints=Constraints(direction, table=0.0))
     _ = problem.field
     begin, cpu = time.perf_counter(), time.process_time()
-    grasps = predictor.run(problem, request).grasps
+    try:
+        grasps = predictor.run(problem, request).grasps
+    except NoGraspError:
+        spent = time.perf_counter() - begin, time.process_time() - cpu
+        return Row(hand.name, obj.name, problem.height_range[1], side, 0, *spent, None, None, 0 if protocol else None)
     seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
     palm = hand.palm_directions(grasps.T_object_wrist) @ torch.tensor(direction)
     held = int(evaluate(problem, grasps, protocol).success.sum()) if protocol else None
@@ -109,7 +114,8 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), help="the usual built-in ones by default")
     parser.add_argument("--source", choices=(AUTO, *source_names()), default=AUTO)
     parser.add_argument("--num", type=int, default=16, help="grasps that are asked for")
-    parser.add_argument("--trials", choices=list(PROTOCOLS), help="also evaluate under a protocol; none has a table")
+    parser.add_argument("--trials", choices=list(PROTOCOLS), help="also evaluate under a protocol; closing on the table")
+    parser.add_argument("--sides", nargs="+", choices=tuple(DIRECTIONS), default=list(DIRECTIONS))
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     predictor, request = GraspPredictor(), GraspRequest(options.num, source=options.source)
@@ -117,22 +123,25 @@ def main() -> None:
     for hand in map(load_hand, options.hands):
         for name in resolve_objects(options.objects):
             obj = resting(load_object(name))
-            rows += [measure(predictor, hand, obj, side, request, options.trials) for side in DIRECTIONS]
+            protocol = options.protocol if options.trials else None
+            rows += [measure(predictor, hand, obj, side, request, protocol) for side in options.sides]
     whole, summary = [row.returned == options.num for row in rows], {}
     for hand in options.hands:
-        for side in DIRECTIONS:
+        for side in options.sides:
             own = [row for row in rows if (row.hand, row.side) == (hand, side)]
             seconds, cpu = (np.quantile(times, (0.5, 0.95)) for times in ([r.seconds for r in own], [r.cpu for r in own]))
             summary[f"{hand}, {side}"] = (
                 f"{sum(r.returned == options.num for r in own)} of {len(own)} objects with all {options.num} grasps; "
                 f"median {seconds[0]:.1f} s, 95 % {seconds[1]:.1f} s; processor time {cpu[0]:.1f} s, 95 % {cpu[1]:.1f} s"
                 + (f"; held {sum(r.held or 0 for r in own)} of {sum(r.returned for r in own)}" if options.trials else ""))
-    keys = {"all_returned": float(np.mean(whole)), "clearance_mm": 1e3 * min(row.clearance for row in rows), **summary,
+    lowest = [row.clearance for row in rows if row.clearance is not None]
+    keys = {"all_returned": float(np.mean(whole)), "clearance_mm": 1e3 * min(lowest, default=0.0), **summary,
             "rows": [dataclasses.asdict(row) | {"asked": options.num} for row in rows]}
     columns = ["hand", "object", "height [mm]", "from", "returned", "time [s]", "processor [s]", "clearance [mm]", "tilt [deg]",
                "held"]
     cells = [
-        [r.hand, r.object, 1e3 * r.height, r.side, r.returned, r.seconds, r.cpu, 1e3 * r.clearance, float(np.rad2deg(r.tilt)),
+        [r.hand, r.object, 1e3 * r.height, r.side, r.returned, r.seconds, r.cpu,
+         "-" if r.clearance is None else 1e3 * r.clearance, "-" if r.tilt is None else float(np.rad2deg(r.tilt)),
          "-" if r.held is None else r.held] for r in rows]
     emit(f"{options.num} grasps of objects that rest on a table, source {options.source}", cells, columns, keys, options.json)
 

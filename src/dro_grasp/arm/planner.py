@@ -28,6 +28,7 @@ from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
@@ -444,4 +445,5 @@ def grasps_in_world(
     if not found:
         raise next(part for part in parts if isinstance(part, NoGraspError))
     ranked = GraspBatch.concatenate(found).sorted_by_score()
-    return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
+    further = {name: column for name, column in ranked.extra.items() if name != TABLE}  # which is of the frame left behind
+    return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist, extra=further)

@@ -43,7 +43,10 @@ class Generate:
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
     """In the object's frame, or in the one that --camera names."""
     table: Annotated[float | None, optional("Z", "no table")] = None
-    """Height [m] of a table in the object's frame; the whole hand stays above it."""
+    """Height [m] of a table in the object's frame; the whole hand stays above it. It is there in simulation until the hand has
+    closed."""
+    touch_table: Annotated[Literal["yes", "no"] | None, optional("yes|no", "beside what lies flat")] = None
+    """Whether fingertips may touch the table."""
     obstacles: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around the object, without the object itself, in the same frame and unit. The hand stays
     clear of it: open and 10 cm back, on the straight way from there in pregrasp, in grasp and in squeeze."""
@@ -93,6 +96,8 @@ class Generate:
         request = GraspRequest(
             self.num, self.seed, self.candidates, self.refine, self.temperature, self.source, self.least_confidence)
         constraints = self.constraints.constraints(self.table)
+        if self.touch_table is not None:
+            constraints = replace(constraints, touch_table=self.touch_table == "yes")
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")

@@ -41,6 +41,9 @@ OBJECT_FILE = "object_file"  # Further column: path of the object, if it is a us
 OBJECT_SCALE = "object_scale"  # Further column: scale of that file
 FRAME = "frame"  # Further column of grasps on a camera's cloud: name of the frame of the poses
 CAMERA = "T_frame_camera"  # Further column of such grasps: pose of the camera in that frame, row by row [m]
+TABLE = "table_plane"
+"""Further column of grasps made for a table: upward unit normal of its plane and height along it in the object's frame [m]; NaN
+for none."""
 ENERGY_TERM = "energy_"  # How the names of further columns with the terms of the grasp energy begin
 Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the name and hash of their object
 
@@ -233,6 +236,20 @@ def outcomes(trial: Any, n: int, extra: Mapping[str, Any]) -> dict[str, Any]:
         "fingers_in_contact": trial.fingers_in_contact.float(), "protocol": (trial.protocol,) * n,
         "extra": {**extra, **further},
     }
+
+
+def table_planes(batch: Any) -> Float[Tensor, "n 4"] | None:
+    """The table of each grasp, NaN for none; None where no grasp has one. ValueError: the column holds something else."""
+    column = batch.extra.get(TABLE)
+    if column is None or not len(batch):
+        return None
+    try:
+        rows = column if isinstance(column, Tensor) else [[torch.nan] * 4 if row is None else list(row) for row in column]
+        planes = torch.as_tensor(rows, dtype=torch.float32).reshape(len(batch), 4)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"column {TABLE} is no plane a grasp ({error}); give four numbers, the upward unit normal and the "
+                         "height along it in metres, or call the column something else") from error
+    return planes if bool(planes.isfinite().any()) else None
 
 
 def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:

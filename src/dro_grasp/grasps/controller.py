@@ -31,12 +31,13 @@ def complete(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config:
 
 
 def pregrasp_and_squeeze(
-    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], centre: Float[Tensor, "3"],
-    config: ControllerConfig | None = None,
+    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"],
+    centre: Float[Tensor, "3"] | Float[Tensor, "n 1 3"], config: ControllerConfig | None = None,
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
     """Joint values q_outer and q_inner of each grasp [rad or m].
 
-    Each finger joint moves away from the object's centre [m], and towards it. The derivative of the mean distance between
+    Each finger joint moves away from the object's centre, or another of each grasp [m], and towards it. The derivative of
+    the mean distance between
     the downstream points and the centre gives the direction, for each grasp and joint. Joints that only spread the fingers,
     joints above the palm and the wrist stay.
     """
@@ -54,7 +55,8 @@ def pregrasp_and_squeeze(
 
 
 def distance_slope(
-    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], centre: Float[Tensor, "3"]
+    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"],
+    centre: Float[Tensor, "3"] | Float[Tensor, "n 1 3"],
 ) -> Float[Tensor, "n n_dof"]:
     """Derivative by each joint of the mean distance of its downstream points to the object's centre [m/rad or m/m]."""
     tree = hand.tree

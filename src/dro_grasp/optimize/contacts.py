@@ -207,3 +207,9 @@ def _slots(
 
 def _normalised(row: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
     return row / row.sum().clamp_min(1e-9)
+
+
+def tip_links(hand: Hand) -> list[int]:
+    """Links that move with a fingertip."""
+    return sorted({link for finger in hand.fingers
+                   for link, joints in zip(finger.links, finger.joints_to_tip, strict=True) if joints == 0})

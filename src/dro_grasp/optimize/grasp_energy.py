@@ -19,7 +19,14 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize import terms as energies
-from dro_grasp.optimize.contacts import ContactCandidates, ContactConfig, LinkPoints, contact_candidates, link_spheres
+from dro_grasp.optimize.contacts import (
+    ContactCandidates,
+    ContactConfig,
+    LinkPoints,
+    contact_candidates,
+    link_spheres,
+    tip_links,
+)
 from dro_grasp.optimize.terms import PointTerm
 
 
@@ -30,6 +37,7 @@ class Surroundings:
     plane: Float[Tensor, "4"] | None = None  # upward unit normal of a plane, and its height along the normal [m]
     obstacles: DistanceField | None = None  # signed distances of other things
     keep_out: Balls | None = None  # places where the hand is not wanted
+    touch_plane: bool = False  # whether fingertips may touch the plane
 
     @property
     def up(self) -> Float[Tensor, "3"] | None:
@@ -39,14 +47,17 @@ class Surroundings:
     @property
     def parts(self) -> dict[str, Surroundings]:
         """The same one by one: plane, obstacles, keep_out."""
-        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "keep_out")
+        return {name: Surroundings(**{name: part}, touch_plane=self.touch_plane) for name in ("plane", "obstacles", "keep_out")
                 if (part := getattr(self, name)) is not None}
 
-    def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Signed distance [m] and its gradient, as of a `DistanceField`."""
+    def distances(
+        self, points: Float[Tensor, "*b 3"], leave: Float[Tensor, "*#b"] | None = None
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Signed distance [m] and its gradient, as of a `DistanceField`; points count as `leave` farther from the plane [m]."""
         distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
         if self.plane is not None:
             distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
+            distance = distance if leave is None else distance + leave
         for part in (self.obstacles, self.keep_out):
             if part is not None:
                 other, slope = part.distances(points)
@@ -66,7 +77,8 @@ class Surroundings:
         """The same on another device."""
         plane = None if self.plane is None else self.plane.to(device)
         obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
-        return Surroundings(plane, obstacles, None if self.keep_out is None else on_device(self.keep_out, device))
+        keep_out = None if self.keep_out is None else on_device(self.keep_out, device)
+        return Surroundings(plane, obstacles, keep_out, self.touch_plane)
 
 
 @dataclass(frozen=True)
@@ -94,6 +106,12 @@ class ContactRegionTerm:
         return PointTerm((self.clear - distance) * near, -gradient * near[..., None])
 
 
+TIP_HEIGHT = 0.0005
+"""Height over a table that fingertips keep which may touch it, where other points of the hand keep `clear` [m] (ours)."""
+PRESSED = 0.02
+"""Depth in a table up to which such a fingertip may be told to squeeze [m] (ours): the table stops it."""
+
+
 class ClearanceTerm(NamedTuple):
     """The weighted term with its gradient."""
 
@@ -114,11 +132,17 @@ class Clearance:
         # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
         filled = surroundings.obstacles is not None or surroundings.keep_out is not None
         self.parts = ((body, torch.zeros_like(body.layout[0])), (ball, radii))[: 1 + filled]
+        tips = torch.tensor(tip_links(hand) if surroundings.touch_plane else [], device=radii.device)
+        self.tips = [torch.isin(points.members.argmax(-1), tips).to(radii) for points, _ in self.parts]
         config, moving = ControllerConfig(), hand.movable & ~hand.abduction
         self.postures = [
             (end, torch.where(moving, share, 0.0).to(end))
             for end, share in ((hand.open_ends, config.outer), (hand.closed_ends, config.inner))]
         """Pregrasp and squeeze: where each joint moves to from the grasp, and how much of the way."""
+        low = clear - TIP_HEIGHT
+        self.leaves = torch.tensor([low, low, clear + PRESSED], device=radii.device)
+        """How much nearer than other points fingertips may come to a table that they may touch, in grasp, pregrasp and squeeze
+        [m]."""
 
     def __call__(
         self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], poses: Float[Tensor, "n n_links 4 4"],
@@ -126,13 +150,14 @@ class Clearance:
     ) -> ClearanceTerm:
         """The term of n grasps, from wrist poses, joints, poses of links, and the points about which hands turn [m]."""
         tree, n = self.hand.tree, len(q)
-        joints = torch.cat([q + share * (end - q) for end, share in self.postures])
+        joints = torch.cat([q[:0], *(q + share * (end - q) for end, share in self.postures)])
         follow = torch.cat([torch.ones_like(q), *((1 - share).expand_as(q) for _, share in self.postures)])
         poses = torch.cat([poses, T.repeat(len(self.postures), 1, 1)[:, None] @ tree.forward(joints)])
         depth, wrenches = poses.new_zeros(len(poses)), poses.new_zeros(*poses.shape[:2], 6)
-        for points, radii in self.parts:
+        leaves = self.leaves[: len(poses) // n].repeat_interleave(n)[:, None]
+        for (points, radii), tips in zip(self.parts, self.tips, strict=True):
             placed = points.place(poses)
-            distance, gradient = self.surroundings.distances(placed)
+            distance, gradient = self.surroundings.distances(placed, leaves * tips)
             inside = energies.penetration(distance - radii - self.clear, gradient)
             depth = depth + inside.value.sum(-1)
             wrenches = wrenches + energies.link_wrenches(placed, self.weight * inside.by_point, points.members)
@@ -142,12 +167,17 @@ class Clearance:
         return ClearanceTerm(value, by_pose, by_joint)
 
     def distance(
-        self, T: Float[Tensor, "*n 4 4"], q: Float[Tensor, "*n n_dof"], surroundings: Surroundings | None = None
+        self, T: Float[Tensor, "*n 4 4"], q: Float[Tensor, "*n n_dof"], surroundings: Surroundings | None = None,
+        leave: float = 0.0,
     ) -> Float[Tensor, "*n"]:
-        """Least distance of hands to the surroundings, or to others [m]."""
+        """Least distance of hands to the surroundings, or to others [m].
+
+        Fingertips that may touch a table count as `leave` farther from it [m].
+        """
         poses = (T[..., None, :, :] @ self.hand.tree.forward(q)).flatten(0, -4)
         around = surroundings or self.surroundings
-        nearest = [(around.distances(points.place(poses))[0] - radii).amin(-1) for points, radii in self.parts]
+        nearest = [(around.distances(points.place(poses), leave * tips)[0] - radii).amin(-1)
+                   for (points, radii), tips in zip(self.parts, self.tips, strict=True)]
         return torch.stack(nearest).amin(0).reshape(q.shape[:-1])
 
 

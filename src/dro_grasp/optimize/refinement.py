@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import side_by_side
 from dro_grasp.geometry.se3 import roma, turned_about
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import ClosingConfig
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.optimize.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.optimize.squeeze import GripConfig
 
 
@@ -68,13 +70,31 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     device = energy.centre.device
     parts = (column.to(device).split(config.batch_size) for column in (grasps.T_object_wrist, grasps.joints))
     with torch.no_grad():
-        ends = side_by_side(lambda T, q: _descend(energy, T, q, config), *parts)
+        ends = side_by_side(lambda T, q: descend_near(energy, T, q, config), *parts)
     T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
     return grasps.with_poses(T, q)
 
 
-def _descend(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: RefineConfig
+class Slope(Protocol):
+    """What a descent needs of an energy."""
+
+    hand: Hand
+
+    def pivot(self, T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+        """The point about which each hand turns [m]."""
+        ...
+
+    def nearest_contacts(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float) -> Int[Tensor, "n c"]:
+        """Its contacts."""
+        ...
+
+    def __call__(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"]) -> Evaluation:
+        """Value and gradient."""
+        ...
+
+
+def descend_near(
+    energy: Slope, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: RefineConfig
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Steps down the gradient; each is kept where it lowers the energy, within the bounds around the start."""
     hand, unit = energy.hand, energy.hand.tree.joint_unit

@@ -73,9 +73,9 @@ def _targets(
     """Pregrasp and squeeze, on the CPU."""
     hand, tree = energy.hand, energy.hand.tree
     T, q = grasps.T_object_wrist.to(energy.centre), grasps.joints.to(energy.centre)
-    outer, inner = pregrasp_and_squeeze(hand, T, q, energy.centre)
     near = NearestPoints.of(energy, T, q)
     touches = near.gap < config.reach
+    outer, inner = pregrasp_and_squeeze(hand, T, q, _middle(energy, near, touches))
     finger = torch.stack([torch.isin(near.links, torch.tensor(f.links, device=q.device)) for f in hand.fingers])
     involved = (touches[:, None] & finger).any(-1)
     forces = contact_forces(near, touches, finger, energy.centre, energy.length, config)
@@ -88,6 +88,15 @@ def _targets(
     target = q + share * (inner - q) + torque * hand.movable * tree.joint_unit**2 / config.stiffness
     lower, upper = torch.minimum(hand.lower, q), torch.maximum(hand.upper, q)
     return outer.cpu(), target.clamp(lower, upper).cpu()
+
+
+def _middle(energy: GraspEnergy, near: NearestPoints, touches: Bool[Tensor, "n l"]) -> Float[Tensor, "n 1 3"]:
+    """What fingers close around [m]: the object; on a table, where they pinch a part of it, their contacts' middle."""
+    around = energy.workspace.surroundings
+    if around is None or not around.touch_plane:
+        return energy.centre.expand(len(touches), 1, 3)
+    on = touches.to(near.points)[..., None]
+    return torch.where(on.sum(1) > 0, (near.points * on).sum(1) / on.sum(1).clamp_min(1), energy.centre)[:, None]
 
 
 def contact_forces(

@@ -14,7 +14,7 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.kinds import Checked
-from dro_grasp.optimize.grasp_energy import Surroundings
+from dro_grasp.optimize.grasp_energy import PRESSED, Surroundings
 from dro_grasp.optimize.squeeze import GripConfig
 from dro_grasp.optimize.starts import APPROACH, angle_to_arc
 from dro_grasp.predict.problem import GraspProblem
@@ -37,6 +37,8 @@ class AdmissionConfig(Checked):
 
     least_clearance: float = 0.002
     """Least distance of a hand's surface points to its surroundings [m]; its corners come up to 2 mm nearer."""
+    least_tip_height: float = -0.001
+    """The same of fingertips that may touch the table. They are told to squeeze up to PRESSED below it."""
     touch: float = 0.003
     """Distance at which a hand touches the object [m]: refined grasps keep 1 mm off it."""
     fewest_fingers: int = 2
@@ -76,7 +78,7 @@ def violations(
     found, constraints, config = {}, problem.constraints, config or AdmissionConfig()
     if problem.surroundings is not None:
         parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}
-        found = {REASONS[name]: ~clear(problem, grasps, part, config.least_clearance) for name, part in parts.items()}
+        found = {REASONS[name]: ~clear(problem, grasps, part, config) for name, part in parts.items()}
     if constraints.max_tilt is not None:
         found[TURNED] = ~facing(problem, grasps)
     if constraints.contact_region:
@@ -103,25 +105,26 @@ def facing(problem: GraspProblem, grasps: GraspBatch, farthest: float = math.inf
 
 
 def clear(
-    problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings, least: float = AdmissionConfig.least_clearance
+    problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings, config: AdmissionConfig | None = None
 ) -> Bool[Tensor, " n"]:
     """Which complete grasps keep the hand out of surroundings.
 
     The hand is fully open 10 cm back along the palm direction, comes straight in pregrasp, grasps and squeezes.
     """
-    near, hand = problem.clearance, problem.hand
+    near, hand, config = problem.clearance, problem.hand, config or AdmissionConfig()
+    leave = config.least_clearance - config.least_tip_height
     assert near is not None
     T = grasps.T_object_wrist
     back = torch.zeros_like(T)
     back[:, :3, 3] = -APPROACH * hand.palm_directions(T)
     opened = hand.canonical_joints(1.0).expand_as(grasps.joints)
-    postures = [(T, grasps.joints), (T, grasps.squeeze_joints), (T + back, opened)]
-    postures += [(T + share * back, grasps.pregrasp_joints) for share in torch.linspace(0, 1, APPROACH_CHECKS).tolist()]
+    postures = [(T, grasps.joints, leave), (T, grasps.squeeze_joints, leave + PRESSED), (T + back, opened, leave)]
+    postures += [(T + share * back, grasps.pregrasp_joints, leave) for share in torch.linspace(0, 1, APPROACH_CHECKS).tolist()]
     closest = torch.full((len(T),), torch.inf)
-    for pose, q in postures:
-        distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings)
+    for pose, q, lower in postures:
+        distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings, lower)
         closest = torch.minimum(closest, distance.cpu())
-    return closest > least
+    return closest > config.least_clearance
 
 
 def holds_in_place(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig) -> Bool[Tensor, " n"]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.files import MAX_QUOTED_CHARS
@@ -26,6 +27,7 @@ MIN_PLANE_COSINE = 0.1  # Least such cosine of a plane that has a height at all 
 Z_AXIS_TOLERANCE = 1e-6  # Largest deviation of a z axis that points upwards (ours)
 MAX_PREGRASP_CLEARANCE = 0.2  # Largest pregrasp clearance that is accepted [m] (ours)
 MAX_MARGIN = 10.0  # Largest margin that is accepted (ours)
+LOW = 0.035  # Height on a table up to which a thing is pinched from above, rather than clasped [m] (ours)
 MAX_BALLS = 1000  # Most balls of a contact region or keep-out (ours): each costs time at every step
 MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a contact region must contain (ours)
 
@@ -44,6 +46,9 @@ class Constraints(Checked):
     """Palm direction; any by default. Over a table, palms also tilt down as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
+    touch_table: bool | None = None
+    """Whether fingertips may touch the table; by default beside an object that lies lower than LOW, which can hardly be grasped
+    otherwise."""
     max_tilt: float | None = None
     """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
     By default palms point roughly along the direction."""
@@ -171,8 +176,14 @@ class Constraints(Checked):
         surroundings = None
         if plane is not None or obstacles is not None or keep_out is not None:
             below = None if plane is None else torch.tensor(plane, dtype=torch.float32)
-            surroundings = Surroundings(below, obstacles, keep_out)
+            touch = below is not None and (lies_low(obj, below) if self.touch_table is None else self.touch_table)
+            surroundings = Surroundings(below, obstacles, keep_out, touch)
         return Workspace(surroundings, Balls.of(self.contact_region))
+
+
+def lies_low(obj: ObjectModel, table: Float[Tensor, "4"]) -> bool:
+    """Whether an object ends less than LOW above a table, so that fingertips have to come down to the table beside it."""
+    return float((torch.from_numpy(obj.cloud) @ table[:3]).max() - table[3]) < LOW
 
 
 def _vector(given: Any) -> Direction:

@@ -110,7 +110,7 @@ class Finished:
     @cached_property
     def grasps(self) -> GraspBatch:
         """The best, complete and eased, as they are returned."""
-        best = self.pool[self.rows]
+        best = self.problem.on_table(self.pool[self.rows])
         return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
 
     @property
@@ -147,8 +147,10 @@ def finish(
     """
     config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
     with watch("refine"):
-        whole = complete(problem, candidates.grasps) if config.refine is None else refine(
-            problem, candidates.grasps, config.refine)
+        if config.refine is None or candidates.exact:
+            whole = complete(problem, candidates.grasps)
+        else:
+            whole = refine(problem, candidates.grasps, config.refine)
     allowed = feasible(problem, whole, config.admission)
     dropped = Counter({TURNED: candidates.turned}) + count_violations(problem, whole[~allowed], config.admission)
     candidates, made = candidates[allowed], len(candidates) + candidates.turned

@@ -103,7 +103,8 @@ class GraspPredictor:
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
         direction: Direction | None = None, max_tilt: float | None = None, table: float | None = None,
         obstacles: Scene | None = None, contact_region: tuple[Ball, ...] = (), keep_out: tuple[Ball, ...] = (),
-        pregrasp_clearance: float | None = None, margin: float | None = None, max_force: float | None = None,
+        pregrasp_clearance: float | None = None, touch_table: bool | None = None, margin: float | None = None,
+        max_force: float | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
         least_confidence: float | None = None,
     ) -> GraspBatch:
@@ -123,6 +124,7 @@ class GraspPredictor:
             contact_region: Balls (x, y, z, radius) in which the hand may touch the object [m].
             keep_out: Balls (x, y, z, radius) that the hand stays out of [m].
             pregrasp_clearance: Least distance in pregrasp between the object and every link that closes [m].
+            touch_table: Whether fingertips may touch the table; None lets them beside what lies flat.
             margin: Multiple of the object's weight that the squeeze holds whichever way gravity pulls.
             max_force: Largest normal force of a contact at the squeeze [N].
             candidates: Candidates for each grasp; the best by score are returned.
@@ -140,7 +142,7 @@ class GraspPredictor:
         """
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
                  "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance,
-                 "margin": margin, "max_force": max_force}
+                 "touch_table": touch_table, "margin": margin, "max_force": max_force}
         wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None and x != ()})
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:
@@ -164,7 +166,7 @@ class GraspPredictor:
             NoGraspError: No grasp was found.
             OptionError: There is no such source, or it does not know the hand.
         """
-        first, rescue = self._roles(request)
+        first, rescue = self._roles(problem, request)
         for source in (first, rescue):
             if source is not None and not source.knows(problem.hand):
                 raise OptionError(f"source '{source.name}' does not know hand '{problem.hand.name}'; choose another source")
@@ -207,10 +209,12 @@ class GraspPredictor:
             return NetworkSource(self.network, config if temperature is None else replace(config, temperature=temperature))
         return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
 
-    def _roles(self, request: GraspRequest) -> tuple[Source | None, Source | None]:
+    def _roles(self, problem: GraspProblem, request: GraspRequest) -> tuple[Source | None, Source | None]:
         """The source that is asked first, and the one that makes rivals for what is not trusted."""
         named = self.source(request.source, request.temperature)
         if request.source == AUTO:
+            if problem.lies_flat:  # the network knows no table, and no hand that pinches beside one
+                return None, self.source(OptimiserSource.name)
             return named, self.source(OptimiserSource.name)
         # The optimiser alone makes as few candidates as are trusted, which takes less time than a fixed number.
         return (None, named) if isinstance(named, OptimiserSource) else (named, None)
@@ -252,7 +256,7 @@ class _Asking:
 
     def until_trusted(self, sources: Sequence[Source]) -> None:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
-        levels, each = self.config.rescue.rounds(self.problem.surroundings is not None)
+        levels, each = self.config.rescue.rounds(self.problem.surroundings is not None and not self.problem.lies_flat)
         for seed, least_score in zip(_drawn(self.request.seed, len(levels)), levels, strict=True):
             lacking = self.request.num if self.done is None else self.done.lacking(least_score)
             if not lacking:

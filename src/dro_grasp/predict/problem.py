@@ -11,12 +11,14 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.geometry.distance_field import Balls, DistanceField
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.optimize.grasp_energy import Clearance, EnergyConfig, GraspEnergy, Surroundings, Workspace
 from dro_grasp.optimize.starts import APPROACH
-from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.constraints import Constraints, lies_low
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,24 @@ class GraspProblem:
     def height_range(self) -> tuple[float, float]:
         """Least and greatest z of the object [m]."""
         return float(self.obj.cloud[:, 2].min()), float(self.obj.cloud[:, 2].max())
+
+    @cached_property
+    def table(self) -> Float[Tensor, "4"] | None:
+        """Upward unit normal and height [m] of the table, on the CPU; None without one."""
+        plane = None if self.surroundings is None else self.surroundings.plane
+        return None if plane is None else plane.cpu()
+
+    @cached_property
+    def lies_flat(self) -> bool:
+        """Whether the object lies low on a table that fingertips may touch."""
+        around = self.surroundings
+        return self.table is not None and around is not None and around.touch_plane and lies_low(self.obj, self.table)
+
+    def on_table(self, grasps: GraspBatch) -> GraspBatch:
+        """The grasps with the table that is there while the hand closes, in simulation too; as they are without one."""
+        if self.table is None:
+            return grasps
+        return grasps.replace(extra={**grasps.extra, TABLE: self.table.repeat(len(grasps), 1)})
 
     @property
     def hand_reach(self) -> float:

@@ -68,6 +68,8 @@ class SettleConfig(Checked):
     """Physics of the first closing, which says where a grasp ends: fingers as strong as each other."""
     protocol: str = "carry"
     """Physics of the later closings, and of the pulls after them."""
+    lifting: float = 1.0
+    """Time of each pull on what lies flat on a table [s], as in a trial: pinches turn slowly."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
@@ -77,7 +79,7 @@ class SettleConfig(Checked):
 def weight_config(problem: GraspProblem, config: SettleConfig) -> WeightConfig:
     """How hard grasps press, as the problem asks."""
     asked = problem.constraints
-    given = {"margin": asked.margin, "max_force": asked.max_force}
+    given = {"margin": asked.margin, "max_force": asked.max_force, "pulling": config.lifting if problem.lies_flat else None}
     return replace(config.weight, **{name: value for name, value in given.items() if value is not None})
 
 
@@ -120,7 +122,8 @@ def settle_best(
         admission: What the constraints let pass.
     """
     config = config or SettleConfig()
-    count = max(round(config.share * len(grasps)), min(len(grasps), least))
+    # The score, which is learned from objects that hang in the air, does not tell which of several pinches lifts.
+    count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
     closed, stable, known = settle_grasps(problem, grasps[best], config)
     wrong = ~feasible(problem, closed, admission)
@@ -157,15 +160,14 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
         HandError: The hand came without its description.
     """
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
-    grasps = complete(problem, grasps.without("score"))
+    grasps = problem.on_table(complete(problem, grasps.without("score")))
     closed = settle(hand, obj, grasps, config.closing)
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
-    again, rows = near & ~still, near.nonzero()[:, 0]
-    better = replaced(closed, still, grip(problem, closed[still], config.refinement))
-    better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
+    rows = near.nonzero()[:, 0]
+    better = problem.on_table(_bettered(problem, grasps, closed, still, near, config)[rows])
     asked = weight_config(problem, config)
-    better = press(hand, obj, better, config.protocol, config=asked)
+    better = problem.on_table(press(hand, obj, better, config.protocol, config=asked))
     state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
     depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
@@ -178,6 +180,27 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
 def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
     """Largest share of its effort with which a joint squeezes [Nm or N]."""
     return (torque * hand.movable).abs().div(find_efforts(hand).limit).amax(1)
+
+
+def _bettered(
+    problem: GraspProblem, grasps: GraspBatch, closed: GraspBatch, still: Bool[Tensor, " n"], near: Bool[Tensor, " n"],
+    config: SettleConfig,
+) -> GraspBatch:
+    """Closed grasps that squeeze with balanced forces, or are refined where closing moved the object."""
+    if problem.lies_flat:
+        return as_before(closed, grasps)
+    again = near & ~still
+    better = replaced(closed, still, grip(problem, closed[still], config.refinement))
+    return replaced(better, again, refine(problem, closed[again], config.refinement))
+
+
+def as_before(closed: GraspBatch, grasps: GraspBatch) -> GraspBatch:
+    """Closed grasps that open and press by as much as the grasps that they were.
+
+    What lies flat is thinner than the distances know that refinement goes by: it would move fingers off what they found.
+    """
+    postures = {name: closed.joints + getattr(grasps, name) - grasps.joints for name in ("pregrasp_joints", "squeeze_joints")}
+    return closed.replace(**postures)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:

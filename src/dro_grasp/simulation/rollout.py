@@ -19,11 +19,13 @@ from dro_grasp.devices import Rows, cores
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.protocols import Perturbations
-from dro_grasp.simulation.scene import TrialScene, object_mass
+from dro_grasp.simulation.scene import TABLE_AWAY, TrialScene, object_mass
 
 FACTORS = ("friction", "mass", "gain")  # Conditions that are factors, as in Perturbations
 
@@ -78,6 +80,8 @@ def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict
 
 RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours
 CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
+GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
+RESTS = 0.003  # Gap up to which an object counts as lying on a table [m]. Ours
 STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a trial needs to continue from an earlier moment
 
 
@@ -142,10 +146,12 @@ class Rollout:
         self.targets = [joints.numpy()[:, scene.actuated] for joints in postures]
         self.ctrl[:] = self.targets[0]
         self.start = self.observe()
+        if scene.table:
+            self._lay(grasps)
         self.frames = [] if stride is None else [self.poses()]
 
     def close(self) -> ObjectState:
-        """Move to the target for the protocol's closing time."""
+        """Move to the target for the protocol's closing time; a table is there until then, and gone afterwards."""
         everyone, steps = np.arange(self.size), self._steps(self.scene.protocol.closing_time)
         if len(self.targets) == 1:
             self._advance(everyone, steps)
@@ -153,6 +159,10 @@ class Rollout:
             for i in range(RAMP):
                 self.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
                 self._advance(everyone, steps // (RAMP * (len(self.targets) - 1)))
+        if self.scene.table:
+            self.batch.bind("mocap_pos")[:] = TABLE_AWAY
+            self.batch.bind("mocap_quat")[:] = [1.0, 0.0, 0.0, 0.0]  # as it is turned now, it may lie over the hand
+            self.force[:] = 0.0
         return self.observe()
 
     def press(self, targets: Float[np.ndarray, "n n_servos"], seconds: float) -> ObjectState:
@@ -229,6 +239,26 @@ class Rollout:
         poses[:, :3, :3], poses[:, :3, 3] = rotation, pose[:, :3] - rotation @ self.scene.obj.centre_of_mass
         return joints, poses
 
+    def _lay(self, grasps: GraspBatch) -> None:
+        """Put each table where the object lies on it, and the object's weight on the table."""
+        # An object that stands elsewhere than the hand expects takes the table along.
+        found = table_planes(grasps)
+        if found is None:
+            return
+        planes, T = found.double().numpy(), grasps.T_object_wrist.double().numpy()
+        laid = np.flatnonzero(np.isfinite(planes).all(1))
+        up, level, rotation = planes[laid, :3], planes[laid, 3], T[laid, :3, :3]
+        lowest = lowest_points(self.scene.obj, up)
+        height = np.minimum(level, lowest) - np.einsum("ni,ni->n", up, T[laid, :3, 3])
+        normal = np.einsum("nij,ni->nj", rotation, up)
+        turned = np.zeros((len(laid), 4))
+        for quaternion, direction in zip(turned, normal, strict=True):
+            mujoco.mju_quatZ2Vec(quaternion, direction)
+        self.batch.bind("mocap_pos")[laid, 0] = height[:, None] * normal
+        self.batch.bind("mocap_quat")[laid, 0] = turned
+        weight = GRAVITY * self.mass[laid] * (lowest - level < RESTS)
+        self.force[laid, self.scene.object_body, :3] = -weight[:, None] * normal
+
     def _change(self, conditions: Conditions) -> None:
         """Give each trial its own friction, mass and servos; the scene is compiled once for all."""
         self.mass *= conditions.mass
@@ -255,6 +285,13 @@ class Rollout:
                 self.batch.step(rows.tolist(), nstep=min(stride, steps - done))
                 if self.stride is not None:
                     self.frames.append(self.poses())
+
+
+def lowest_points(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """How far the lowest point of an object, as it collides, is along each upward direction [m]."""
+    if obj.balls is not None:
+        return (up @ obj.balls.centres.double().numpy().T - obj.balls.radii.double().numpy()).min(1)
+    return (up @ np.concatenate([vertices for vertices, _ in obj.parts]).T).min(1)
 
 
 def rollouts(

@@ -18,6 +18,7 @@ from torch import Tensor
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.effort import find_efforts
@@ -132,6 +133,7 @@ def servo_joints(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k
 SOLVER_ITERATIONS = 20
 """Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
 FAR_AWAY = (0.0, 0.0, 5.0)  # Place of the object until a grasp is written [m]. Ours
+TABLE_AWAY = (0.0, 0.0, -10.0)  # Place of a table while there is none [m]. Ours
 CACHED_SCENES = 8  # Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols
 
 
@@ -145,6 +147,8 @@ class TrialScene:
     hand: Hand
     obj: ObjectModel
     protocol: Protocol
+    table: bool = False
+    """Whether there is a table, the body `table`, which is TABLE_AWAY until a grasp is written."""
 
     @cached_property
     def object_body(self) -> int:
@@ -189,26 +193,27 @@ class SceneKey:
     hand_sha256: str
     solid_sha256: str
     protocol: Protocol
+    table: bool
     hand: Hand = field(compare=False)
     obj: ObjectModel = field(compare=False)
 
 
-def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
+def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = False) -> TrialScene:
     """The scene of a pair; the process keeps the last few, least recently used first to go. Errors as below."""
     require_simulable(hand, obj)
-    return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, hand, obj))
+    return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, table, hand, obj))
 
 
 @lru_cache(maxsize=CACHED_SCENES)
 def _build_once(key: SceneKey) -> TrialScene:
-    return build_scene(key.hand, key.obj, key.protocol)
+    return build_scene(key.hand, key.obj, key.protocol, key.table)
 
 
 def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> TrialScene:
     """The scene in which the grasps are simulated; errors are those of `simulate`."""
     require_pair(hand, obj)
     grasps.require_hand(hand)
-    return cached_scene(hand, obj, find_protocol(protocol))
+    return cached_scene(hand, obj, find_protocol(protocol), table_planes(grasps) is not None)
 
 
 def require_simulable(hand: Hand, obj: ObjectModel) -> None:
@@ -219,17 +224,19 @@ def require_simulable(hand: Hand, obj: ObjectModel) -> None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
 
 
-def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
-    """Put a hand and an object into one model; errors are those of `require_simulable`."""
+def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = False) -> TrialScene:
+    """Put a hand and an object, and perhaps a table, into one model; errors are those of `require_simulable`."""
     require_simulable(hand, obj)
     scene = _empty_scene(protocol)
     attach(scene, hand_spec(hand, protocol), scene.worldbody.add_frame())
     add_servos(scene, hand, protocol)
     add_object(scene, obj, protocol)
+    if table:
+        _add_table(scene, protocol)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _exclude_resting_contacts(scene, hand)
-        return TrialScene(scene.compile(), hand, obj, protocol)
+        return TrialScene(scene.compile(), hand, obj, protocol, table)
 
 
 def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
@@ -267,6 +274,13 @@ def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name:
     body.explicitinertial, body.mass, body.ipos = True, mass, [0, 0, 0]
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     return body
+
+
+def _add_table(scene: mujoco.MjSpec, protocol: Protocol) -> None:
+    """A plane that each trial places for itself. The object rubs on it, and the hand slides, as it does on itself."""
+    body = scene.worldbody.add_body(name="table", mocap=True, pos=TABLE_AWAY)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], condim=1, mass=0.0,
+                  friction=[protocol.friction, protocol.torsional_friction, 1e-4])
 
 
 def object_mass(obj: ObjectModel, protocol: Protocol) -> float:

@@ -120,7 +120,7 @@ def _scene_of_trial(scene: TrialScene, trial: int) -> TrialScene:
     """The scene of a trial: in the last ones the object has coarse parts."""
     rules = scene.protocol.perturbations
     fine = trial < rules.trials - rules.coarse
-    return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol)
+    return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol, scene.table)
 
 
 def settle(

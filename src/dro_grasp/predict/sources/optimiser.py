@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+import torch
+
+from dro_grasp._version import __version__
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.contacts import ContactConfig
+from dro_grasp.optimize.pinches import PinchConfig, PinchSearch, opposed_pairs
 from dro_grasp.optimize.starts import StartConfig
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.predict.admission import facing
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import POINTS, Candidates, Progress, Source
 
+PINCHES = f"dro-grasp {__version__}, pinches 1"
+"""Provenance of pinches; the number counts up when the method changes."""
 DESCENT_STEPS = 1200  # Steps of a descent that is not settled: ten times those of the data engine (ours)
 
 
@@ -25,6 +31,8 @@ class OptimiserConfig(Checked):
     """Grasps that are optimised for each candidate; those of lowest energy are proposed."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The descent. The problem's constraints say where it starts."""
+    pinch: PinchConfig | None = field(default_factory=PinchConfig)
+    """How pinches are sought, which are proposed instead where the object lies flat on a table; None descends there too."""
     farthest_direction: float = math.radians(20.0)
     """Largest angle between the palm direction of a candidate and the direction that was asked for [rad]."""
 
@@ -46,6 +54,8 @@ class OptimiserSource(Source):
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
         """Of several descents for each candidate, those of lowest energy."""
         wanted, config = problem.constraints, self.config
+        if problem.lies_flat and config.pinch is not None and len(found := pinch(problem, num, seed, config)):
+            return replace(Candidates.of(problem, found, self.n_points), exact=True)
         starts = replace(config.synthesis.starts, direction=wanted.direction, max_tilt=wanted.max_tilt,
                          contact_region=wanted.contact_region)
         synthesis = replace(config.synthesis, starts=starts)
@@ -54,6 +64,23 @@ class OptimiserSource(Source):
         kept = facing(problem, grasps, config.farthest_direction)
         found = Candidates.of(problem, grasps[kept][:num].poses_only(), self.n_points)
         return replace(found, turned=min(int((~kept).sum()), num - len(found)))
+
+
+def pinch(problem: GraspProblem, num: int, seed: int, config: OptimiserConfig) -> GraspBatch:
+    """The best of several pinches for each that is wanted; none where no two sides of the object are opposed."""
+    generator, wanted, table = torch.Generator().manual_seed(seed), problem.constraints, problem.table
+    assert table is not None
+    assert config.pinch is not None
+    energy = problem.energy(config.synthesis.energy)
+    search = PinchSearch(energy, problem.mass, wanted.direction, wanted.max_tilt, config.pinch)
+    pairs = opposed_pairs(problem.obj, table, search.widest(generator), config.pinch.pairs * num, config.pinch,
+                          generator)
+    if pairs is None:
+        return GraspBatch.none(problem.hand, problem.obj)
+    found = search.search(pairs, generator)
+    best = found.rows(found.cost.argsort(stable=True)[:num])
+    return GraspBatch.create(problem.hand, problem.obj, best.T, best.joints, pregrasp_joints=best.pregrasp,
+                             squeeze_joints=best.squeeze, seed=seed, provenance=PINCHES)
 
 
 class DescentSource(Source):

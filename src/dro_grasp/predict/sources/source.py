@@ -35,6 +35,8 @@ class Candidates:
     """How many others the source dropped because they turned away from the palm direction."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by part of the source [s]."""
+    exact: bool = False
+    """Whether their fingers are where they are meant to be, so that refinement would only move them."""
 
     @staticmethod
     def of(problem: GraspProblem, grasps: GraspBatch, n_points: int = POINTS) -> Candidates:
