@@ -40,7 +40,7 @@ def small(home: Path, **more: object) -> OnboardingConfig:
     """Small shards, and few grasps in the report."""
     given = OnboardingConfig(
         0.01, ("sphere",), ("can",), 2, str(home / "untrained.safetensors"), 1, "network", grasps_drawn=3,
-        engine=EngineConfig("strict", candidates=32, min_candidates=32))
+        engine=EngineConfig(candidates=32, min_candidates=32))
     return replace(given, **more)
 
 
