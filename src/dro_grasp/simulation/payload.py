@@ -183,13 +183,12 @@ RELAXED = 1.6  # Over-relaxation. Source: Boyd et al. 2011
 
 
 def _crossing(masses: Float[Tensor, " m"], used: Float[Tensor, "n m"]) -> Float[Tensor, " n"]:
-    """The mass at which `used` first exceeds 1, between two masses by their logarithms; 0 where it does from the start."""
-    over = torch.cat([used > 1, torch.ones_like(used[:, :1], dtype=torch.bool)], 1)
-    first = over.int().argmax(1)
-    after, log = first.clamp(1, len(masses) - 1), masses.log()
-    use = used.clamp_min(1e-6).log()
-    rows = torch.arange(len(used))
-    low, high = use[rows, after - 1], use[rows, after]
-    between = (log[after - 1] - low / (high - low).clamp_min(1e-6) * (log[after] - log[after - 1])).exp()
-    found = torch.where(first == len(masses), masses[-1], between)
-    return torch.where(first == 0, torch.zeros_like(found), found)
+    """Where `used` exceeds 1 after the largest mass at which it does not, by logarithms; 0 where it does at all masses."""
+    # A squeeze that is not quite balanced moves light objects more than their weight does, so the smallest masses may exceed.
+    held, numbers, log = used <= 1, torch.arange(len(masses)), masses.log()
+    last = torch.where(held, numbers, -1).amax(1)
+    before, rows, use = last.clamp(0, len(masses) - 2), torch.arange(len(used)), used.clamp_min(1e-6).log()
+    low, high = use[rows, before], use[rows, before + 1]
+    between = (log[before] - low / (high - low).clamp_min(1e-6) * (log[before + 1] - log[before])).exp()
+    found = torch.where(last == len(masses) - 1, masses[-1], between)
+    return torch.where(last < 0, torch.zeros_like(found), found)
