@@ -52,7 +52,7 @@ class Benchmark:
     device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
-    least_confidence: Annotated[float | None, optional("P", "0.1")] = None
+    least_confidence: Annotated[float | None, optional("P", "0.2")] = None
     """Grasps that hold with less probability are not returned, and count as failures; 0 returns all."""
     controls: bool = True  # Without --methods: also evaluate start, optimiser and, with a bundle, the mean grasp.
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None

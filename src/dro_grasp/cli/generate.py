@@ -62,7 +62,7 @@ class Generate:
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
     mass: Mass = None  # Mass of the object [kg], which the grasps shall carry.
-    least_confidence: Annotated[float | None, optional("P", "0.1; 0 with --no-refine")] = None
+    least_confidence: Annotated[float | None, optional("P", "0.2; 0 with --no-refine")] = None
     """Grasps that hold with less probability are not returned; 0 returns all."""
     scale: float = 1.0  # Multiplies the object's coordinates; 0.001 for files in millimetres.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None

@@ -62,7 +62,7 @@ class Plan:
     without a table has none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
-    least_confidence: Annotated[float | None, optional("P", "0.1")] = None
+    least_confidence: Annotated[float | None, optional("P", "0.2")] = None
     """Grasps that hold with less probability are not tried; 0 tries all."""
     planner_seconds: float = 3.0  # Longest time for one path [s].
     seed: int = 0  # Seed of grasps, inverse kinematics and planner.

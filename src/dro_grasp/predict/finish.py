@@ -26,7 +26,7 @@ from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
 
-LEAST_CONFIDENCE = 0.1
+LEAST_CONFIDENCE = 0.2
 """Grasps that hold with less probability are not returned. Ours: see the notebook of `carry` for what other values cost."""
 HOPELESS = -4.0  # Scores below this are alike in `best_mean` [log-odds] (ours)
 
