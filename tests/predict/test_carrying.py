@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,14 +14,13 @@ from dro_grasp.objects.shape import DENSITY, solid_of, with_mass
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, lacking_payload, settle_best, settle_grasps, weight_config
+from dro_grasp.predict.settling import SettleConfig, settle_best, settle_grasps, weight_config
 from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.forces import find_forces
 from dro_grasp.simulation.grasp_state import WeightConfig
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import object_mass
 from tests.helpers.loaded_hands import loaded_hand
-from tests.helpers.toy_batches import make
 
 HAND, CAN = loaded_hand("gripper3"), dro.load_object("can")
 HELD = SettleConfig(weight=WeightConfig(pull=0.0))
@@ -81,7 +79,7 @@ def test_settled_grasps_state_payload_and_forces(grasps: dro.GraspBatch) -> None
     assert float(found.payload[stable].max()) > CAN.mass
     read = find_forces(HAND, CAN, found[stable])
     ratio = read.squeeze_force / found.squeeze_force[stable]
-    assert 0.7 < float(ratio.median()) < 1.4, "closing once more presses about as hard"
+    assert 0.95 < float(ratio.nanmedian()) < 1.05, "closing once more presses as hard"
 
 
 def test_a_heavier_object_is_squeezed_harder_and_a_fragile_one_gently(grasps: dro.GraspBatch) -> None:
@@ -95,18 +93,7 @@ def test_a_heavier_object_is_squeezed_harder_and_a_fragile_one_gently(grasps: dr
 
 
 def test_what_cannot_carry_the_mass_scores_less(grasps: dro.GraspBatch) -> None:
-    problem = GraspProblem(HAND, with_mass(CAN, 1.0))
-    known = scored(problem, grasps)
-    free, dear = (settle_best(problem, known, 12, replace(HELD, payload_worth=worth))[1] for worth in (0.0, 1.0))
-    lacks = lacking_payload(free, 1.5)
-    settled = free.payload.isfinite() & (free.score > HELD.unstable_score + 2)
-    assert bool((lacks[settled] > 0).any())
-    torch.testing.assert_close(
-        dear.score[settled], torch.maximum(free.score - lacks, dear.score)[settled], msg="by the logarithm of what lacks")
-    assert (dear.score <= free.score + 1e-6).all()
-
-
-def test_what_lacks_is_the_logarithm_of_a_factor() -> None:
-    payloads = make(4).replace(payload=torch.tensor([1.0, 0.5, 0.0, torch.nan]))
-    assert lacking_payload(payloads, 1.0).tolist() == pytest.approx([0, math.log(2), math.log(20), 0])
-    assert lacking_payload(payloads, 0.0).tolist() == [0, 0, 0, 0]
+    light, heavy = (settle_best(problem, scored(problem, grasps), 12).grasps.confidence for problem in (
+        GraspProblem(HAND, CAN), GraspProblem(HAND, with_mass(CAN, 8.0))))
+    assert float(light.max()) > 0.9
+    assert float(heavy.max()) < 0.2, "8 kg are too much for three fingers of 1 Nm"

@@ -39,7 +39,7 @@ FIELDS = ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "scor
 CHANGED = {
     "few steps": FinishConfig(refine=RefineConfig(steps=2)),
     "nothing settles": FinishConfig(settle=None),
-    "none holds": FinishConfig(settle=SettleConfig(deepest=-1.0)),
+    "none holds": FinishConfig(settle=SettleConfig(deepest=-1.0), least_confidence=0.0),
     "nothing": FinishConfig.nothing(),
 }
 """Ways to finish that each change what comes out."""

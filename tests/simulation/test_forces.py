@@ -21,7 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.simulation import payload as module
 from dro_grasp.simulation.forces import find_forces, largest_payload
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press
 from dro_grasp.simulation.payload import GRAVITY, PayloadConfig, Squeezes, generators, given_way, payloads, servo_torques
 from dro_grasp.simulation.pressure import Pressing
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -191,13 +191,12 @@ def test_the_weighed_payload_is_where_trials_begin_to_fail(hand: Hand, obj: Obje
 @pytest.mark.parametrize("limit", [1.0, 2.0])
 def test_no_link_presses_harder_than_it_may(hand: Hand, obj: ObjectModel, limit: float) -> None:
     heavy, grasps = with_mass(obj, 0.3), light_grasp(hand, obj)
-    freely = grasp_state(hand, heavy, grasps, "carry", config=WeightConfig(pull=0.0))[1]
-    gently = grasp_state(hand, heavy, grasps, "carry", config=WeightConfig(pull=0.0, max_force=limit))[1]
-    hardest = [
-        find_forces(hand, heavy, grasps.replace(squeeze_joints=squeeze.joints)).squeeze_contacts[0].hardest_link
-        for squeeze in (freely, gently)]
+    freely, gently = (
+        press(hand, heavy, grasps, "carry", config=WeightConfig(max_force=most)) for most in (math.inf, limit))
+    found = [find_forces(hand, heavy, pressed) for pressed in (freely, gently)]
+    hardest = [forces.squeeze_contacts[0].hardest_link for forces in found]
     assert hardest[1] <= 1.15 * limit < hardest[0]
-    assert float(gently.force) < float(freely.force)
+    assert float(found[1].squeeze_force) < float(found[0].squeeze_force)
     assert float(gently.payload) <= float(freely.payload)
 
 

@@ -154,7 +154,7 @@ def test_a_motor_that_moves_two_jaws_presses_with_half_its_effort_each(tmp_path:
 def test_the_efforts_of_predicted_grasps_balance_their_contacts() -> None:
     """Pressed in MuJoCo, the hand's contacts ask of its joints what the file says, followers included."""
     hand, obj = loaded_hand("barrett"), load_object("can")
-    grasps = dro.GraspPredictor().predict(hand, obj, num=3, seed=0, source="optimiser", candidates=2)
+    grasps = dro.GraspPredictor().predict(hand, obj, num=3, seed=1, source="optimiser", candidates=2)
     messages = yaml.safe_load(contents(hand, grasps, "moveit"))
     efforts = np.array([message["grasp_posture"]["points"][0]["effort"] for message in messages])
     scene = scene_of(hand, obj, grasps, SettleConfig().protocol)
