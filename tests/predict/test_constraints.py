@@ -134,10 +134,10 @@ def test_every_field_moves_with_the_frame_or_is_the_same_in_all_of_them() -> Non
     everything = Constraints(
         direction=(1.0, 0.0, -1.0), table=-0.1, max_tilt=0.5, obstacles=load_scene(np.full((40, 3), 0.7)),
         contact_region=((0.0, 0.0, 0.0, 0.1),), keep_out=((0.1, 0.0, 0.0, 0.02),), pregrasp_clearance=0.01,
-        margin=2.0, max_force=5.0)
+        touch_table=True, margin=2.0, max_force=5.0)
     assert all(getattr(everything, f.name) not in (None, ()) for f in dataclasses.fields(Constraints)), "each field is tried"
     T = np.eye(4)
     T[:2, :2], T[:3, 3] = [[0.0, -1.0], [1.0, 0.0]], (0.1, 0.2, 0.3)
     moved = everything.moved(T)
     same = {f.name for f in dataclasses.fields(Constraints) if getattr(moved, f.name) == getattr(everything, f.name)}
-    assert same == {"max_tilt", "pregrasp_clearance", "margin", "max_force"}
+    assert same == {"max_tilt", "pregrasp_clearance", "touch_table", "margin", "max_force"}

@@ -46,9 +46,6 @@ class Constraints(Checked):
     """Palm direction; any by default. Over a table, palms also tilt down as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
-    touch_table: bool | None = None
-    """Whether fingertips may touch the table; by default beside an object that lies lower than LOW, which can hardly be grasped
-    otherwise."""
     max_tilt: float | None = None
     """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
     By default palms point roughly along the direction."""
@@ -62,6 +59,9 @@ class Constraints(Checked):
     pregrasp_clearance: float | None = None
     """Least distance between the object and every link that closes, in pregrasp [m]: the error of place that the approach
     tolerates. The pregrasp opens as far as that takes. By default joints open by a quarter of the range left."""
+    touch_table: bool | None = None
+    """Whether fingertips may touch the table; by default beside an object that lies lower than LOW, which can hardly be grasped
+    otherwise."""
     margin: float | None = None
     """Multiple of the object's weight that the squeeze holds whichever way gravity pulls; None takes the configuration's."""
     max_force: float | None = None

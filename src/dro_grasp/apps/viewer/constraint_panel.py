@@ -58,10 +58,11 @@ class ConstraintPanel:
         """
         tilt, table, clearance = (_number(field) for field in (self.max_tilt, self.table, self.pregrasp_clearance))
         return Constraints(
-            None if self.direction.value == ANY else half_axis_direction(self.direction.value), table,
-            None if tilt is None else math.radians(tilt),
-            None if self.obstacles.value == NOTHING else scene(self.obstacles.value),
-            _balls(self.contact_region), _balls(self.keep_out), None if clearance is None else clearance / 1000)
+            direction=None if self.direction.value == ANY else half_axis_direction(self.direction.value), table=table,
+            max_tilt=None if tilt is None else math.radians(tilt),
+            obstacles=None if self.obstacles.value == NOTHING else scene(self.obstacles.value),
+            contact_region=_balls(self.contact_region), keep_out=_balls(self.keep_out),
+            pregrasp_clearance=None if clearance is None else clearance / 1000)
 
     def draw(self, constraints: Constraints, obj: ObjectModel) -> None:
         """Show table, places and scene beside the object."""
