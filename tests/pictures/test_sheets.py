@@ -244,3 +244,11 @@ def test_a_sheet_of_too_many_pixels_is_refused(
     assert main(given) == 2
     assert "3 pictures of 64 x 48 are" in capsys.readouterr().err
     assert main([*given, "--count", "2"]) == 0
+
+
+def test_a_long_title_over_few_pictures_is_not_cut() -> None:
+    tile = np.full((20, 30, 3), 200, np.uint8)
+    sheets = [np.asarray(pictures.contact_sheet([tile], [("0", None)], title)) for title in ("a" * 60, "a" * 120)]
+    inked = [int(np.flatnonzero((sheet[:HEADER] < 200).any((0, 2))).max()) for sheet in sheets]
+    assert inked[1] > 1.9 * inked[0], "all of its letters are there"
+    assert all(right < sheet.shape[1] - 8 for right, sheet in zip(inked, sheets, strict=True))

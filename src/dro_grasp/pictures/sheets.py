@@ -234,10 +234,11 @@ def contact_sheet(
     height, width = tiles[0].shape[:2]
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
-    sheet = Image.new("RGB", (columns * width, HEADER + rows * (height + CAPTION)), (255, 255, 255))
+    font, large = ImageFont.load_default(14), ImageFont.load_default(18)
+    wide = max(columns * width, math.ceil(large.getlength(title)) + 32)
+    sheet = Image.new("RGB", (wide, HEADER + rows * (height + CAPTION)), (255, 255, 255))
     pen = ImageDraw.Draw(sheet)
-    pen.text((16, 12), title, fill=INK, font=ImageFont.load_default(18))
-    font = ImageFont.load_default(14)
+    pen.text((16, 12), title, fill=INK, font=large)
     for i, (tile, (text, passed)) in enumerate(zip(tiles, captions, strict=True)):
         x, y = (i % columns) * width, HEADER + (i // columns) * (height + CAPTION)
         sheet.paste(Image.fromarray(tile), (x, y))
