@@ -76,7 +76,7 @@ SEED = 0
 def hands(folder: Path, made: int) -> list[str]:
     """Training hands, varied ones and made-up ones, in the order in which they are used."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = list(HANDS)
+    found: list[str] = list(HANDS)
     for name, factor in zip(("allegro", "barrett", "gripper3", "leaphand", "shadowhand"), (*FACTORS, 0.6), strict=True):
         path = folder / f"{name}_{factor:g}.urdf"
         if not path.exists():

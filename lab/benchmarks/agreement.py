@@ -28,6 +28,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.finish import finish
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import simulate
 from lab.benchmarks.report import emit, rate
@@ -48,7 +49,7 @@ def candidates(predictor: GraspPredictor, hand: Hand, obj: ObjectModel, num: int
     problem, method = GraspProblem(hand, obj), Method("network", predictor)
     rules = predictor.config.finish
     made = method.propose(problem, num, pair_seed(seed, hand, obj))
-    return finish(problem, made, replace(rules, settle=replace(rules.settle, share=1.0)), num).grasps
+    return finish(problem, made, replace(rules, settle=replace(rules.settle or SettleConfig(), share=1.0)), num).grasps
 
 
 def outcomes(options: argparse.Namespace) -> Iterator[dict[tuple[str, str], Bool[Tensor, " n"]]]:

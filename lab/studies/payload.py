@@ -86,8 +86,8 @@ def measure(hand_name: str, object_name: str, grasps: int, seed: int) -> Iterato
     joints = torch.from_numpy(rollout.poses()[0]).float()
     clock = [time.process_time()]
     chosen = squeezes_of(hand, contacts, joints, part.squeeze_joints, weight)
-    moved = (torch.from_numpy(x).float() for x in (closed.shift(rollout.start), closed.turn(rollout.start)))
-    predicted = payloads(chosen, *moved, weight.payload)
+    shift, turn = (torch.from_numpy(x).float() for x in (closed.shift(rollout.start), closed.turn(rollout.start)))
+    predicted = payloads(chosen, shift, turn, weight.payload)
     clock.append(time.process_time())
     grown = weighed(rollout, chosen, predicted, weight.payload)
     clock.append(time.process_time())
@@ -111,7 +111,7 @@ def summary(rows: list[dict[str, float | str]]) -> list[list[object]]:
         error = np.abs(value / truth - 1)[some]
         spent = [row[f"{way} [ms]"] for row in rows if f"{way} [ms]" in row]
         lines.append([way, int(some.sum()), 100 * float(np.median(error)), 100 * float(np.quantile(error, 0.75)),
-                      float(np.median((value / truth)[some])), float(spearmanr(value[some], truth[some])[0]),
+                      float(np.median((value / truth)[some])), float(np.asarray(spearmanr(value[some], truth[some]))[0]),
                       float(np.mean(np.array(spent, float))) if spent else "-"])
     return lines
 

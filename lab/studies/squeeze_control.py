@@ -6,6 +6,8 @@ softer servos; then the object's weight pulls along six directions. Training han
 Run: python -m lab.studies.squeeze_control --hands allegro barrett --objects can cube --num 8
 """
 
+# MuJoCo 4 exports its names at run time only.
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 from dataclasses import dataclass

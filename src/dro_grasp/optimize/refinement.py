@@ -80,15 +80,15 @@ class Slope(Protocol):
 
     hand: Hand
 
-    def pivot(self, T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+    def pivot(self, T: Float[Tensor, "n 4 4"], /) -> Float[Tensor, "n 3"]:
         """The point about which each hand turns [m]."""
         ...
 
-    def nearest_contacts(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float) -> Int[Tensor, "n c"]:
+    def nearest_contacts(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float, /) -> Int[Tensor, "n c"]:
         """Its contacts."""
         ...
 
-    def __call__(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"]) -> Evaluation:
+    def __call__(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"], /) -> Evaluation:
         """Value and gradient."""
         ...
 

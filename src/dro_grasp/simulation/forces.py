@@ -86,9 +86,11 @@ def find_forces(
     parts = [GraspForces((), (), nothing, nothing, none, none)]
     for part, rollout in rollouts(scene_of(hand, obj, whole, rules), hand, whole, workers):
         parts.append(_forces(rollout, part, config, weigh))
-    return GraspForces(*(
-        torch.cat(column) if isinstance(column[0], Tensor) else tuple(one for many in column for one in many)
-        for column in zip(*([getattr(p, name) for name in GraspForces.__dataclass_fields__] for p in parts), strict=True)))
+    return GraspForces(
+        tuple(one for part in parts for one in part.grasp_contacts),
+        tuple(one for part in parts for one in part.squeeze_contacts),
+        torch.cat([part.grasp_torque for part in parts]), torch.cat([part.squeeze_torque for part in parts]),
+        torch.cat([part.payload for part in parts]), torch.cat([part.largest_payload for part in parts]))
 
 
 def _forces(rollout: Rollout, grasps: GraspBatch, config: WeightConfig, weigh: bool) -> GraspForces:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.devices import Rows
+from dro_grasp.devices import Record, Rows
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -107,10 +107,13 @@ def grasp_state(
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
         parts.append(replace(state, gave=_pulled(rollout, closed, config)))
-    state, squeeze = (
-        type(many[0])(**{f.name: torch.cat([getattr(one, f.name) for one in many]) for f in fields(many[0])})
-        for many in (parts, squeezes))
-    return state, squeeze
+    return _joined(parts), _joined(squeezes)
+
+
+def _joined(parts: list[Record]) -> Record:
+    """The rows of all parts, one below the other."""
+    names = [f.name for f in fields(parts[0])]  # type: ignore[arg-type]
+    return type(parts[0])(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
