@@ -19,6 +19,7 @@ from dro_grasp.predict.score.holding import (
     SHIPPED_HOLDING,
     Evidence,
     HoldingScore,
+    gives_way,
     holding_features,
     holding_score,
     load_holding_score,
@@ -122,3 +123,12 @@ def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None
     holds = simulate(hand, obj, grasps, "carry").success
     assert 20 < int(holds.sum()) < len(holds) - 20
     assert roc_area(holding_score(grasps.score, known.rows(rows)), holds) > max(0.7, roc_area(grasps.score, holds))
+
+
+def test_how_far_what_gives_way_would_have_gone_plays_no_role() -> None:
+    motions = (0.021, 0.01), (0.3, 2.0), (0.019, 0.2)
+    one, other, firm = (holding_features(torch.tensor([1.0]), held(gave=gave)) for gave in motions)
+    torch.testing.assert_close(one, other)
+    assert not torch.equal(one, firm)
+    states = held(gave=(0.019, 0.2)).state, held(gave=(0.019, 0.3)).state, Evidence.none(1, 0.3).state
+    assert [bool(gives_way(state)) for state in states] == [False, True, False]
