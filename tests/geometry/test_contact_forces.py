@@ -29,3 +29,12 @@ def test_the_edges_of_a_cone_lean_as_far_as_friction_allows_evenly_around(inward
     around = edges - axis
     torch.testing.assert_close(around.norm(dim=-1), torch.full((6,), 0.4))
     torch.testing.assert_close((around * around.roll(1, 0)).sum(-1) / 0.16, torch.full((6,), 0.5))
+
+
+def test_several_targets_of_a_matrix_are_answered_as_each_alone() -> None:
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(5, 9, 14, generator=generator), torch.randn(5, 9, 3, generator=generator)
+    together = nonnegative_least_squares(a, b, 0.01, 50)
+    assert together.shape == (5, 14, 3)
+    for column, alone in enumerate(b.unbind(-1)):
+        torch.testing.assert_close(together[..., column], nonnegative_least_squares(a, alone, 0.01, 50))

@@ -22,7 +22,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding import holding_score
+from dro_grasp.predict.score.holding import gives_way, holding_score
 from dro_grasp.predict.settling import (
     AWAY,
     DEEP,
@@ -95,6 +95,7 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
     assert torch.equal(known.state.shift.isfinite(), near)
     assert torch.equal(known.state.gave.isfinite().all(1), near)
     assert float(known.state.shift[stable].max()) < 0.02
+    assert torch.equal(found.payload.isfinite(), stable & ~gives_way(known.state)), "payloads of what holds alone"
 
 
 @pytest.mark.parametrize("quantity", ["shift", "turn", "depth"])
@@ -150,7 +151,7 @@ def test_only_the_better_share_is_settled_and_what_is_not_held_counts_as_unstabl
     assert rows.tolist() == [1, 3]
     torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
     outcome = settle_grasps(PROBLEM, known[rows], never)
-    expected = holding_score(scored(PROBLEM, known[rows]).score, outcome.known)
+    expected = holding_score(scored(PROBLEM, known[rows]).score, outcome.known).clamp_max(never.unstable_score)
     torch.testing.assert_close(found.score, expected)
     assert not outcome.stable.any()
     assert set(doubts) <= {AWAY, DEEP}

@@ -22,9 +22,14 @@ from dro_grasp.simulation.grasp_state import (
     ContactForces,
     WeightConfig,
     grasp_state,
+    press,
+    pressed,
     unanswered,
     weight_torques,
 )
+from dro_grasp.simulation.protocols import CARRY
+from dro_grasp.simulation.rollout import Pulls, rollouts
+from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, power_grasp
 
@@ -169,3 +174,37 @@ def test_nothing_presses_for_a_weight_without_margin_or_contacts(hand: Hand) -> 
     tips = np.array(hand.tips)
     some = held_by(tips, np.eye(4)[:, :3] * 0.03 + 0.05, np.zeros(3))
     assert not weight_torques(hand, [some], joints, MASS, WeightConfig(margin=0.0)).any()
+
+
+def test_payloads_of_some_rows_are_those_of_all(hand: Hand, obj: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dro_grasp.simulation.rollout.CHUNK", 2)  # the rows are of several parts
+    grasps, rows = power_grasp(hand, obj, 3), torch.tensor([True, False, True])
+    T = grasps.T_object_wrist.clone()
+    T[:, 2, 3] -= torch.tensor([0.0, 0.003, 0.006])
+    grasps = grasps.replace(T_object_wrist=T)
+    every, done = press(hand, obj, grasps, "carry"), pressed(hand, obj, grasps, "carry")
+    found = done.payloads(rows)
+    assert torch.equal(found.isnan(), ~rows)
+    torch.testing.assert_close(found[rows], every.payload[rows])
+    assert float(every.payload[0]) > 0
+    assert float((every.payload[0] - every.payload[2]).abs()) > 1e-4, "a wrong order of rows shows"
+    torch.testing.assert_close(done.grasps.squeeze_joints, every.squeeze_joints)
+
+
+def test_pulls_end_for_what_gives_way_and_stay_the_same_for_what_holds(hand: Hand, obj: ObjectModel) -> None:
+    grasps = complete(hand, power_grasp(hand, obj, 2), torch.as_tensor(obj.centre_of_mass))
+    loose = grasps.squeeze_joints.clone()
+    loose[1] = grasps.pregrasp_joints[1]
+    grasps = grasps.replace(squeeze_joints=loose)
+    found = []
+    for farthest in (CARRY.max_displacement, math.inf):
+        (_, rollout), = rollouts(scene_of(hand, obj, grasps, CARRY), hand, grasps, workers=1)
+        pulls = Pulls(9.81, 0.2, reset=True, from_start=True, farthest=farthest)
+        found.append(rollout.push(rollout.close(), np.ones(2, bool), pulls)[0])
+    (ends, goes_on), limit = found, CARRY.max_displacement
+    assert ends[0].max() < limit < ends[1].max()
+    np.testing.assert_array_equal(ends[0], goes_on[0])
+    first = int((goes_on[1] >= limit).argmax())
+    np.testing.assert_array_equal(ends[1, :first + 1], goes_on[1, :first + 1])
+    assert (ends[1, first:] == ends[1, first]).all(), "later columns keep the value at which it ended"
+    assert not np.array_equal(ends[1], goes_on[1])

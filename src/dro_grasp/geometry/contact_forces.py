@@ -10,16 +10,21 @@ from torch import Tensor
 
 
 def nonnegative_least_squares(
-    a: Float[Tensor, "n m k"], b: Float[Tensor, "n m"], ridge: float, iterations: int
-) -> Float[Tensor, "n k"]:
-    """Minimise |a x - b|^2 + ridge |x|^2 over x >= 0, for n problems at once. Source: Beck and Teboulle 2009 (FISTA)."""
+    a: Float[Tensor, "n m k"], b: Float[Tensor, "n m *c"], ridge: float, iterations: int
+) -> Float[Tensor, "n k *c"]:
+    """Minimise |a x - b|^2 + ridge |x|^2 over x >= 0, for n problems at once. Source: Beck and Teboulle 2009 (FISTA).
+
+    With a last axis, b has c columns, each with its own x.
+    """
+    if b.ndim == 2:
+        return nonnegative_least_squares(a, b[..., None], ridge, iterations)[..., 0]
     hessian = a.mT @ a + ridge * torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
-    slope = (a.mT @ b[..., None])[..., 0]
-    step = 1 / hessian.abs().sum(-1).amax(-1, keepdim=True)  # at most one over the largest eigenvalue
+    slope = a.mT @ b
+    step = 1 / hessian.abs().sum(-1).amax(-1)[:, None, None]  # at most one over the largest eigenvalue
     x = torch.zeros_like(slope)
     ahead, momentum = x, 1.0
     for _ in range(iterations):
-        new = (ahead - step * ((hessian @ ahead[..., None])[..., 0] - slope)).clamp_min(0)
+        new = (ahead - step * (hessian @ ahead - slope)).clamp_min(0)
         following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
         ahead = new + (momentum - 1) / following * (new - x)
         x, momentum = new, following

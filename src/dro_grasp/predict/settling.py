@@ -25,12 +25,11 @@ from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.score.holding import Evidence, holding_score
+from dro_grasp.predict.score.holding import Evidence, gives_way, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press
-from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed
 from dro_grasp.simulation.trial import hand_shift, settle
 
 AWAY = "push it away as they close"  # The object is lost at the first closing
@@ -137,10 +136,9 @@ def settle_best(
 
 def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> tuple[str, ...]:
     """What closing showed against each grasp, in words; empty for nothing."""
-    rules, state = protocol(config.protocol), known.state
-    gives = (state.gave[:, 0] > rules.max_displacement) | (state.gave[:, 1] > rules.max_rotation)
+    state = known.state
     found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, MOVES: state.shift >= config.farthest,
-             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives}
+             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives_way(state)}
     return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
@@ -149,7 +147,8 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
 
     Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
     forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
-    grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was.
+    grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was. Payloads
+    are of those that hold and do not give way under the weight.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -167,13 +166,15 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     rows = near.nonzero()[:, 0]
     better = problem.on_table(_bettered(problem, grasps, closed, still, near, config)[rows])
     asked = weight_config(problem, config)
-    better = problem.on_table(press(hand, obj, better, config.protocol, config=asked))
+    done = pressed(hand, obj, better, config.protocol, config=asked)
+    better = problem.on_table(done.grasps)
     state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
     depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force)
-    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), better.payload, state)
+    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force,
+                            payload=done.payloads(holds & ~gives_way(state), asked.payload))
+    known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), state)
     return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
 
 

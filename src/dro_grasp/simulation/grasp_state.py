@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import Record, Rows
@@ -59,6 +59,25 @@ class GraspState(Rows):
 
 
 @dataclass(frozen=True)
+class Pressed:
+    """Hands that have closed, and how hard they squeeze for whatever mass."""
+
+    grasps: GraspBatch
+    """Where closing leaves hand and object, squeezing for the object's weight; without payloads."""
+    squeezes: tuple[Squeezes, ...]
+    """Of the same grasps in their order, in parts."""
+
+    def payloads(self, rows: Bool[Tensor, " n"], config: PayloadConfig | None = None) -> Float[Tensor, " n"]:
+        """Payloads of the grasps in these rows; NaN in the others, since payloads take time [kg]."""
+        parts = []
+        for squeezes, wanted in zip(self.squeezes, rows.split([len(s.joints) for s in self.squeezes]), strict=True):
+            found, still = torch.full((len(wanted),), torch.nan), torch.zeros(int(wanted.sum()))
+            found[wanted] = payloads(squeezes.rows(wanted), still, still, config)
+            parts.append(found)
+        return torch.cat([torch.zeros(0), *parts])
+
+
+@dataclass(frozen=True)
 class Squeeze(Rows):
     """How hard n hands squeeze."""
 
@@ -75,7 +94,18 @@ def press(
     The squeeze is what holds the object still after closing, and in addition torques that press for its weight. A grasp whose
     closing is unsound, or loses the object, stays where it is. Arguments and errors are those of `simulate`.
     """
+    config = config or WeightConfig()
+    done = pressed(hand, obj, grasps, protocol, config=config, workers=workers)
+    return done.grasps.replace(payload=done.payloads(torch.ones(len(grasps), dtype=torch.bool), config.payload))
+
+
+def pressed(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    config: WeightConfig | None = None, workers: int | None = None
+) -> Pressed:
+    """As `press`, with payloads only of what they are asked for."""
     config, scene, parts = config or WeightConfig(), scene_of(hand, obj, grasps, protocol), [grasps[:0]]
+    squeezes = []
     for part, rollout in rollouts(scene, hand, grasps, workers):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
@@ -83,12 +113,13 @@ def press(
         reached = torch.from_numpy(rollout.poses()[0]).to(joints)
         chosen = squeezes_of(hand, contact_forces(rollout), reached, part.squeeze_joints, config)
         targets = chosen.targets(torch.from_numpy(rollout.mass).to(joints)[:, None])[:, 0]
-        still = torch.zeros(len(part)).to(joints)
+        squeezes.append(chosen)
         parts.append(part.replace(
-            T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints),
-            payload=payloads(chosen, still, still, config.payload)))
-    pressing = GraspBatch.concatenate(parts)
-    return _gentle(scene, pressing, NEARLY * config.max_force, workers) if math.isfinite(config.max_force) else pressing
+            T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints)))
+    found = GraspBatch.concatenate(parts)
+    if math.isfinite(config.max_force):
+        found = _gentle(scene, found, NEARLY * config.max_force, workers)
+    return Pressed(found, tuple(squeezes))
 
 
 def grasp_state(
@@ -138,11 +169,14 @@ def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | N
 
 
 def _pulled(rollout: Rollout, closed: ObjectState, config: WeightConfig) -> Float[Tensor, "n 2"]:
-    """How far closing and pulls together move and turn the object; what closing loses is not pulled."""
+    """How far closing and pulls together move and turn the object, until it gives way; what closing moves so far is lost."""
     if config.pull == 0:
         return torch.full((rollout.size, 2), torch.nan)
-    alive = closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE)
-    pulls = Pulls(config.pull * config.gravity, config.pulling, reset=True, from_start=True)
+    rules = rollout.scene.protocol
+    farthest, largest = min(rules.max_displacement, LOST_DISTANCE), rules.max_rotation
+    alive = closed.stable & (closed.shift(rollout.start) < farthest) & (closed.turn(rollout.start) < largest)
+    pulls = Pulls(
+        config.pull * config.gravity, config.pulling, reset=True, from_start=True, farthest=farthest, largest_turn=largest)
     moved, turned, _ = rollout.push(closed, alive, pulls)
     gave = np.stack([np.nan_to_num(moved, nan=LOST_DISTANCE).max(1), np.nan_to_num(turned, nan=np.pi).max(1)], 1)
     return torch.from_numpy(gave).float()
@@ -231,11 +265,10 @@ def weight_forces(touch: Pressing, mass: Float[Tensor, " n"], config: WeightConf
     cone = friction_cone(touch.normal, config.friction, config.edges) * touch.on[..., None, None]
     wrench = torch.cat([cone, torch.linalg.cross(touch.arm[..., None, :].expand_as(cone) / LEVER, cone)], -1).flatten(1, 2).mT
     pulls = torch.as_tensor(FORCES).to(mass)
-    goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).repeat(n, 1)
-    amounts = nonnegative_least_squares(wrench.repeat_interleave(len(pulls), 0), goal, SMALLEST, config.iterations)
-    missing = ((wrench.repeat_interleave(len(pulls), 0) @ amounts[..., None])[..., 0] - goal).norm(dim=-1)
-    able = missing.reshape(n, len(pulls)).amax(1) < config.missing
-    mean = amounts.unflatten(0, (n, len(pulls))).mean(1).unflatten(1, (k, config.edges))
+    goal = torch.cat([-pulls, torch.zeros_like(pulls)], -1).mT.expand(n, 6, len(pulls))
+    amounts = nonnegative_least_squares(wrench, goal, SMALLEST, config.iterations)
+    able = (wrench @ amounts - goal).norm(dim=1).amax(1) < config.missing
+    mean = amounts.mean(-1).unflatten(1, (k, config.edges))
     return (config.margin * config.gravity * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
 
 
@@ -243,24 +276,23 @@ def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], frictio
     """What is missing for the contacts to answer pushes: for the worst of six directions, and on average."""
     # Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
     # share of the push that stays unanswered.
-    n = len(contacts)
-    normal, arm = torch.zeros(n, CONTACTS, 3), torch.zeros(n, CONTACTS, 3)
-    normal[..., 2], pressure = 1.0, torch.zeros(n, CONTACTS)
+    n, most = len(contacts), min(CONTACTS, max((len(c.pressure) for c in contacts), default=0)) or 1
+    normal, arm = torch.zeros(n, most, 3), torch.zeros(n, most, 3)
+    normal[..., 2], pressure = 1.0, torch.zeros(n, most)
     for i, c in enumerate(contacts):
-        kept = np.argsort(-c.pressure)[:CONTACTS]
+        kept = np.argsort(-c.pressure)[:most]
         for table, values in ((normal, c.normal), (arm, c.arm), (pressure, c.pressure)):
             table[i, :len(kept)] = torch.as_tensor(values[kept], dtype=torch.float32)
     on = (pressure > 0).float()
     cone = friction_cone(normal, friction, EDGES)
     scale = (pressure / (UNIT * mass[:, None]))[..., None, None]
     wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1) * scale
-    same = CHANGE * torch.eye(CONTACTS).repeat_interleave(EDGES, 1) * on.repeat_interleave(EDGES, 1)[:, None]
+    same = CHANGE * torch.eye(most).repeat_interleave(EDGES, 1) * on.repeat_interleave(EDGES, 1)[:, None]
     matrix = torch.cat([wrench.flatten(1, 2).mT, same], 1)
     push = torch.as_tensor(FORCES, dtype=torch.float32) * PUSH / UNIT
-    answer = torch.cat([-push, torch.zeros(6, 3)], 1).expand(n, 6, 6)
-    goal = torch.cat([answer, (CHANGE * on)[:, None].expand(n, 6, CONTACTS)], -1).flatten(0, 1)
-    matrix = matrix.repeat_interleave(6, 0)
+    answer = torch.cat([-push, torch.zeros(6, 3)], 1).mT.expand(n, 6, 6)
+    goal = torch.cat([answer, (CHANGE * on)[..., None].expand(n, most, 6)], 1)
     x = nonnegative_least_squares(matrix, goal, RIDGE, STEPS)
-    missing = ((matrix @ x[..., None])[..., 0] - goal).norm(dim=-1).reshape(n, 6).clamp_max(NO_ANSWER)
+    missing = (matrix @ x - goal).norm(dim=1).clamp_max(NO_ANSWER)
     missing[on.sum(1) == 0] = NO_ANSWER
     return torch.stack([missing.amax(1), missing.mean(1)], 1)

@@ -8,12 +8,13 @@ the object. Source: Cutkosky and Kao 1989 for springs of a grasp, Moreau's least
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.devices import Rows
 from dro_grasp.geometry.contact_forces import friction_cone
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
@@ -62,7 +63,7 @@ class PayloadConfig(Checked):
 
 
 @dataclass(frozen=True)
-class Squeezes:
+class Squeezes(Rows):
     """How hard each of n hands squeezes for whatever mass: as it does anyhow, and in addition for the weight."""
 
     hand: Hand
@@ -73,6 +74,11 @@ class Squeezes:
     contacts: Pressing
     stiffness: float  # of the servos [Nm/rad]
     max_force: float = math.inf  # of the contacts of a link [N]
+
+    def rows(self, index: Bool[Tensor, " n"]) -> Squeezes:
+        """Some of the hands."""
+        own = {name: getattr(self, name)[index] for name in ("joints", "base", "torques", "forces")}
+        return replace(self, contacts=self.contacts.rows(index), **own)
 
     def targets(self, mass: Float[Tensor, "n m"]) -> Float[Tensor, "n m n_dof"]:
         """Targets for these masses [kg] of each hand.

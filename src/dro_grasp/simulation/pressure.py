@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import Rows
 from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.rollout import Rollout, quiet
 from dro_grasp.simulation.scene import PREFIX, TrialScene
@@ -80,7 +81,7 @@ def link_of_body(scene: TrialScene) -> Int[np.ndarray, " n_bodies"]:
 
 
 @dataclass(frozen=True)
-class Pressing:
+class Pressing(Rows):
     """At most k contacts of each of n closed hands with the object, and what a force there asks of the joints."""
 
     normal: Float[Tensor, "n k 3"]  # into the object

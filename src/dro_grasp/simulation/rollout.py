@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -114,6 +115,8 @@ class Pulls:
     seconds: float  # duration of each [s]
     reset: bool  # whether each starts where the first one started; otherwise where the one before ended
     from_start: bool = False  # whether motion counts from the labelled grasp, not from where the first one started
+    farthest: float = LOST_DISTANCE  # an object that moves so far is not pulled again [m]
+    largest_turn: float = math.inf  # nor one that turns so far [rad]
 
 
 class Rollout:
@@ -214,7 +217,7 @@ class Rollout:
             displacement[rows, k:] = now.shift(origin.rows(rows))[:, None]
             rotation[rows, k:] = now.turn(origin.rows(rows))[:, None]
             stable[rows] = now.stable
-            alive[rows] = now.stable & (displacement[rows, k] < LOST_DISTANCE)
+            alive[rows] = now.stable & (displacement[rows, k] < pulls.farthest) & (rotation[rows, k] < pulls.largest_turn)
         return displacement, rotation, stable
 
     def observe(self, rows: Int[np.ndarray, " k"] | None = None) -> ObjectState:

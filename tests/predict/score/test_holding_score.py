@@ -19,6 +19,7 @@ from dro_grasp.predict.score.holding import (
     SHIPPED_HOLDING,
     Evidence,
     HoldingScore,
+    gives_way,
     holding_features,
     holding_score,
     load_holding_score,
@@ -35,10 +36,10 @@ FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "contacts": 9
 
 
 def held(gave: tuple[float, float] = (0.001, 0.02), worst: float = 0.4, moved: float = 0.002, stable: bool = True,
-         effort: float = 0.4, depth: float = 0.001, mass: float = 0.3, payload: float = 0.9, **changes: float) -> Evidence:
+         effort: float = 0.4, depth: float = 0.001, mass: float = 0.3, **changes: float) -> Evidence:
     values = {k: torch.tensor([v]) for k, v in (FIRM | changes).items()}
     state = GraspState(**values, unanswered=torch.tensor([[worst, 0.8 * worst]]), gave=torch.tensor([gave]))
-    numbers = (torch.tensor([x]) for x in (moved, stable, depth, effort, mass, payload))
+    numbers = (torch.tensor([x]) for x in (moved, stable, depth, effort, mass))
     return Evidence(*numbers, state)
 
 
@@ -48,7 +49,7 @@ def score(of: float, known: Evidence) -> float:
 
 @pytest.mark.parametrize("worse", [
     {"speed": 0.05, "spin": 1.0, "gave": (0.1, 3.0)}, {"shift": 0.018, "turn": 0.4, "gave": (0.03, 0.5)}, {"mass": 3.0},
-    {"gave": (0.1, 3.0)}, {"payload": 0.02}, {"depth": 0.006, "stable": False},
+    {"gave": (0.1, 3.0)}, {"depth": 0.006, "stable": False},
     {"contacts": 0.0, "links": 0.0, "pressure": 0.0, "slip": 3.0, "worst": 3.0, "gave": (0.1, 3.0)},
     {"stable": False, "moved": 0.04},
 ])
@@ -86,7 +87,7 @@ def test_calibration_keeps_the_order_and_the_offset() -> None:
 
 def test_rows_that_closed_twice_are_filled_in() -> None:
     one, none = held(), Evidence.none(3, 0.2)
-    known = none.known(torch.tensor([1]), one.depth, one.effort, one.payload, one.state)
+    known = none.known(torch.tensor([1]), one.depth, one.effort, one.state)
     assert known.state.shift.isnan().tolist() == [True, False, True]
     assert known.state.gave[1].tolist() == pytest.approx([0.001, 0.02])
     assert known.rows(torch.tensor([1])).state.unanswered.shape == (1, 2)
@@ -122,3 +123,12 @@ def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None
     holds = simulate(hand, obj, grasps, "carry").success
     assert 20 < int(holds.sum()) < len(holds) - 20
     assert roc_area(holding_score(grasps.score, known.rows(rows)), holds) > max(0.7, roc_area(grasps.score, holds))
+
+
+def test_how_far_what_gives_way_would_have_gone_plays_no_role() -> None:
+    motions = (0.021, 0.01), (0.3, 2.0), (0.019, 0.2)
+    one, other, firm = (holding_features(torch.tensor([1.0]), held(gave=gave)) for gave in motions)
+    torch.testing.assert_close(one, other)
+    assert not torch.equal(one, firm)
+    states = held(gave=(0.019, 0.2)).state, held(gave=(0.019, 0.3)).state, Evidence.none(1, 0.3).state
+    assert [bool(gives_way(state)) for state in states] == [False, True, False]

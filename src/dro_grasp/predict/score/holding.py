@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from dro_grasp.devices import Rows
 from dro_grasp.network.checkpoints import SHIPPED_FOLDER, load_small
 from dro_grasp.simulation.grasp_state import GraspState
+from dro_grasp.simulation.protocols import CARRY
 
 SHIPPED_HOLDING = SHIPPED_FOLDER / "ranking" / "holding.safetensors"  # The model that ships
 LEAST_MOTION = 1e-4  # Motions below this look alike [m, rad, m/s, rad/s] (ours)
@@ -23,8 +24,7 @@ MOST_MOTION = 0.1  # Motions of an object above this look alike: it is lost [m] 
 LEAST_TURN = 1e-3  # Turns under the weight below this look alike [rad] (ours)
 LEAST_MASS = 1e-3  # Masses below this look alike [kg] (ours)
 DEEP = 0.01  # Depths above this look alike [m] (ours)
-LEAST_SHARE = 0.05  # Payloads that are a smaller share of the mass look alike, and those that are as large a multiple (ours)
-FEATURES = 21  # Numbers of each grasp that the model sees; see `holding_features`
+FEATURES = 20  # Numbers of each grasp that the model sees; see `holding_features`
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,6 @@ class Evidence(Rows):
     """Largest share of its effort with which a joint squeezes."""
     mass: Float[Tensor, " n"]
     """The object's mass [kg]."""
-    payload: Float[Tensor, " n"]
-    """Predicted payload [kg]."""
     state: GraspState
     """How the object is held after the last closing."""
 
@@ -57,11 +55,10 @@ class Evidence(Rows):
         unknown = torch.full((n,), torch.nan)
         pair = torch.full((n, 2), torch.nan)
         state = GraspState(**{f.name: unknown for f in fields(GraspState)} | {"unanswered": pair, "gave": pair})
-        return Evidence(unknown, torch.zeros(n, dtype=torch.bool), unknown, unknown, torch.full((n,), mass), unknown, state)
+        return Evidence(unknown, torch.zeros(n, dtype=torch.bool), unknown, unknown, torch.full((n,), mass), state)
 
     def known(
-        self, rows: Int[Tensor, " k"], depth: Float[Tensor, " k"], effort: Float[Tensor, " k"], payload: Float[Tensor, " k"],
-        state: GraspState,
+        self, rows: Int[Tensor, " k"], depth: Float[Tensor, " k"], effort: Float[Tensor, " k"], state: GraspState,
     ) -> Evidence:
         """The same with what the last closing showed of some rows."""
         def put(old: Float[Tensor, "n *rest"], new: Float[Tensor, "k *rest"]) -> Float[Tensor, "n *rest"]:
@@ -70,20 +67,24 @@ class Evidence(Rows):
             return found
 
         filled = GraspState(**{f.name: put(getattr(self.state, f.name), getattr(state, f.name)) for f in fields(GraspState)})
-        return replace(self, depth=put(self.depth, depth), effort=put(self.effort, effort), payload=put(self.payload, payload),
-                       state=filled)
+        return replace(self, depth=put(self.depth, depth), effort=put(self.effort, effort), state=filled)
+
+
+def gives_way(state: GraspState) -> Bool[Tensor, " n"]:
+    """Which objects the weight moves or turns farther than `carry` allows; those that were not pulled do not count."""
+    return (state.gave[:, 0] > CARRY.max_displacement) | (state.gave[:, 1] > CARRY.max_rotation)
 
 
 def holding_features(score: Float[Tensor, " n"], known: Evidence) -> Float[Tensor, "n features"]:
     """The model's inputs, from what the ranking network says of grasps [log-odds] and what closing showed; NaN: unknown."""
-    state = known.state
-    gave = torch.stack([state.gave[:, 0].clamp(LEAST_MOTION, MOST_MOTION), state.gave[:, 1].clamp_min(LEAST_TURN)], 1).log()
+    state, limits = known.state, torch.tensor([CARRY.max_displacement, CARRY.max_rotation])
+    # What gives way is not pulled on, so that how far it would have gone plays no role.
+    gave = torch.where(gives_way(state)[:, None], limits, state.gave).clamp_min(torch.tensor([LEAST_MOTION, LEAST_TURN])).log()
     motion = torch.stack([state.shift, state.turn, state.speed, state.spin], 1).clamp_min(LEAST_MOTION).log()
     amounts = torch.stack([state.contacts, state.links, state.pressure, known.effort], 1).log1p()
     moved = known.moved.clamp(LEAST_MOTION, MOST_MOTION).log()
     flags = torch.stack([known.stable, known.moved.isfinite(), state.shift.isfinite()], 1).to(score)
-    share = (known.payload / known.mass).clamp(LEAST_SHARE, 1 / LEAST_SHARE).log()
-    single = torch.stack([share, score, moved, known.depth.clamp(0, DEEP) / DEEP, known.mass.clamp_min(LEAST_MASS).log(),
+    single = torch.stack([score, moved, known.depth.clamp(0, DEEP) / DEEP, known.mass.clamp_min(LEAST_MASS).log(),
                           state.slip.clamp_max(2)], 1)
     return torch.cat([single, motion, amounts, state.unanswered, gave, flags], 1)
 
