@@ -1,7 +1,7 @@
 """Weigh grasps: the largest mass that a closed hand holds in simulation while it squeezes for it.
 
 A trial for each of many masses would take too long. Here the hand closes once, and the object is pulled as each of a few masses
-would, for a fifth of the time of a trial. What it would still move is told by how fast it moves then. Ours.
+would, for a fifth of the time of a trial. How fast it moves then tells what it would still move. Ours.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.payload import GRAVITY, Squeezes
 from dro_grasp.simulation.pressure import contact_forces
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 
 Moment = dict[str, Float[np.ndarray, "n k"]]  # As of `Rollout.moment`
+LESS = 0.95  # Share of a mass that gave way, which its grasp may still carry (ours)
 NOT_HELD = 1e3  # Share of what an object may move that one has used whose simulation is unsound (ours)
 
 
@@ -34,13 +35,13 @@ NOT_HELD = 1e3  # Share of what an object may move that one has used whose simul
 class WeighingConfig(Checked):
     """How grasps are weighed (ours)."""
 
-    rounds: int = 5
+    rounds: int = 4
     """Masses that are tried."""
     beyond: float = 1.5
     """The first of them, as a multiple of the predicted payload: it shows which directions are the worst."""
     step: float = 1.7
     """Factor between two masses, until one is held and one is not; then their geometric mean is tried."""
-    pressing: float = 0.1
+    pressing: float = 0.05
     """Time in which the hand takes to the squeeze for a mass [s]."""
     pulling: float = 0.2
     """Time of each pull [s]."""
@@ -54,7 +55,7 @@ def weigh(
 ) -> Float[Tensor, " n"]:
     """Payloads of grasps that state one, weighed in simulation [kg].
 
-    Each hand closes with its squeeze, which is made for the object's mass. Arguments and errors are those of `simulate`.
+    Each hand closes with its squeeze, which is made for the object's mass. Errors are those of `simulate`.
 
     Args:
         hand: The hand of the grasps.
@@ -76,6 +77,23 @@ def weigh(
         found[rows[begin:begin + len(part)]] = weighed(rollout, chosen, part.payload, weight, config, made_for)
         begin += len(part)
     return found
+
+
+def observed(
+    payload: Float[Tensor, " n"], gave: Float[Tensor, "n 2"], mass: float, protocol: str | Protocol = DEFAULT_PROTOCOL
+) -> Float[Tensor, " n"]:
+    """Payloads that agree with what a mass did [kg]: what held it carries at least as much, and what gave way less.
+
+    Args:
+        payload: Payloads [kg].
+        gave: How far the mass moved [m] and turned [rad] the object; NaN where that was not tried.
+        mass: The mass that pulled [kg].
+        protocol: How far an object may move.
+    """
+    rules = find_protocol(protocol)
+    held = (gave[:, 0] < rules.max_displacement) & (gave[:, 1] < rules.max_rotation)
+    clamped = torch.where(held, payload.clamp_min(mass), payload.clamp_max(LESS * mass))
+    return torch.where(gave.isnan().any(1), payload, clamped)
 
 
 def weighed(
