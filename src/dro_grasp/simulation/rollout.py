@@ -199,6 +199,14 @@ class Rollout:
         self._advance(rows, self._steps(seconds))
         return self.observe(rows)
 
+    def make_heavy(self, mass: Float[np.ndarray, " n"]) -> None:
+        """Give each object another mass [kg], and inertia in proportion; go back to a moment afterwards."""
+        factor = mass / self.mass
+        self.batch.expand("body_mass")[:, self.scene.object_body] *= factor
+        self.batch.expand("body_inertia")[:, self.scene.object_body] *= factor[:, None]
+        self.batch.set_const()
+        self.mass = mass.copy()
+
     def push(
         self, closed: ObjectState, alive: Bool[np.ndarray, " n"], pulls: Pulls | None = None
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:

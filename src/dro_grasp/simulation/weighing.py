@@ -45,7 +45,7 @@ class WeighingConfig(Checked):
     """Time in which the hand takes to the squeeze for a mass [s]."""
     pulling: float = 0.2
     """Time of each pull [s]."""
-    going_on: float = 0.1
+    going_on: float = 0.2
     """Time for which the object would go on as fast as in the second half of a pull [s]."""
 
 
@@ -111,17 +111,20 @@ def weighed(
         made_for: Mass for which the base of `chosen` squeezes already [kg].
     """
     bounds, config, closed = (weight or WeightConfig()).payload, config or WeighingConfig(), rollout.moment()
+    own = rollout.mass.copy()
     least, most = math.log(bounds.least), math.log(bounds.most)
     at = (config.beyond * guess.double()).clamp(bounds.least, bounds.most).log().numpy()
     low, high, tried = np.full(len(at), -np.inf), np.full(len(at), np.inf), _Tried.nothing(len(at))
     for _ in range(config.rounds):
         mass = np.exp(at)
         targets = chosen.targets((torch.from_numpy(mass).to(guess) - made_for)[:, None])[:, 0].numpy()
+        rollout.make_heavy(mass)  # a light object would move at once where a heavy one has hardly begun to
         rollout.go_back(closed)
         rollout.press(targets[:, rollout.scene.actuated], config.pressing)
         held = _pull(rollout, mass, tried, np.isinf(high), config)
         low, high = np.where(held, np.maximum(low, at), low), np.where(held, high, np.minimum(high, at))
         at = _next(low, high, config.step).clip(least, most)
+    rollout.make_heavy(own)
     rollout.go_back(closed)
     none = np.isinf(low) & (high <= least + math.log(config.step))
     found = np.where(none, 0.0, np.exp(_next(low, high, math.sqrt(config.step)).clip(least, most)))
