@@ -119,6 +119,9 @@ MEASUREMENTS = {
         for name, path in PUBLISHED.items()}),
     "confidence": Measurement(
         "Whether confidence is how often grasps hold, on hands and objects that no weights were trained on", _confidence()),
+    "payload": Measurement("The payload that `generate` states, beside trials with growing mass", {
+        _short(hand): f"python -m lab.studies.payload --hands {hand} --objects assets:validate --pairs 6 --grasps 4 --json"
+        for hand in UNSEEN_HANDS}),
     "views": Measurement("The paper's hands on objects seen in part", {
         f"{view}, {_short(hand)}": _benchmark(
             "auto", hand, OBJECTS["validate"], f"--view {view} --num 16 --stages returned --protocols {FAST}")

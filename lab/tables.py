@@ -13,6 +13,7 @@ import functools
 import hashlib
 import json
 import math
+import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from lab import pages
 from lab.benchmarks.report import ROOT
 from lab.measurements import MEASUREMENTS, ROBOTS
 from lab.runner import RESULTS
+from lab.studies import payload
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Pages that have markers."""
@@ -363,6 +365,16 @@ def training_told(results: Results) -> str:
     return f"trained for {found['seconds'] / 60:.0f} minutes of one core"
 
 
+def payload_error(results: Results) -> str:
+    """Median error of stated payloads, of trials that were repeated, and of how many grasps."""
+    rows = [row for found in results.cells("payload").values() for row in found["rows"]]
+    held = [row for row in rows if row["trials"] > payload.INTERVALS[0][0]]
+    stated, again = (
+        100 * statistics.median(abs(row[way] / row["trials"] - 1) for row in held) for way in (payload.WEIGHED, payload.AGAIN))
+    return (f"{stated:.0f} % in the median of {len(held)} grasps (trials repeated: {again:.0f} %; {len(rows) - len(held)} more "
+            "held no mass in trials)")
+
+
 def lifted(results: Results, robot: str) -> str:
     """Share of attempts in which a robot held the object."""
     tried = results.cell("lifts", f"{robot}, cloud")["attempts"]
@@ -445,6 +457,7 @@ VALUES: dict[str, Callable[[Results], str]] = {
     "gpu.told": gpu,
     "data.labels-told": labels_told,
     "fidelity.training": training_told,
+    "payload.error": payload_error,
     **{f"lifts.{robot}": functools.partial(lifted, robot=robot) for robot in ROBOTS},
 }
 """Single numbers by name."""

@@ -1,4 +1,4 @@
-"""Error of payloads: what is predicted, what is weighed with growing mass, and what a linear program allows, beside trials.
+"""Error of payloads: what is predicted, what is weighed and returned, and what a linear program allows, beside trials.
 
 The payload by trials is the largest mass at which a grasp holds under `carry` while it squeezes for that mass, found by halving
 the interval of logarithms. It is found twice, in other intervals: trials of a heavier mass may hold where those of a
@@ -21,25 +21,29 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 
+from dro_grasp.errors import NoGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import weigh_settled
 from dro_grasp.simulation.contacts import measure_penetration
-from dro_grasp.simulation.forces import largest_payloads, weighed
-from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
-from dro_grasp.simulation.payload import Squeezes, payloads
+from dro_grasp.simulation.forces import largest_payloads
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press, squeezes_of
+from dro_grasp.simulation.payload import Squeezes
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.rollout import Conditions, Rollout, rollouts
 from dro_grasp.simulation.scene import TrialScene, scene_of
 from dro_grasp.simulation.trial import run_trial
+from dro_grasp.simulation.weighing import WeighingConfig, observed
 from lab.benchmarks.report import emit
 
 ROUNDS = 7  # Halvings of the interval
 INTERVALS = (0.01, 20.0), (0.013, 15.0)  # Masses between which payloads are looked for, each time [kg]
-WAYS = ("predicted", "weighed", "linear program", "trials again")
+WEIGHED, AGAIN = "weighed", "trials again"
+WAYS = ("predicted, closing included", WEIGHED, "linear program", AGAIN)
 
 
 @dataclass
@@ -72,33 +76,43 @@ class Pair:
 
 
 def measure(hand_name: str, object_name: str, grasps: int, seed: int) -> Iterator[dict[str, float | str]]:
-    """The payloads of each grasp of a pair."""
+    """The payloads of each grasp of a pair that settles."""
     config = PredictorConfig()
-    free = replace(config.finish.settle, weight=WeightConfig(margin=0.0, pull=0.0)) if config.finish.settle else None
-    predictor = GraspPredictor(config=replace(config, finish=replace(config.finish, settle=free)))
-    hand, obj = load_hand(hand_name), load_object(object_name)
-    found = predictor.run(GraspProblem(hand, obj), GraspRequest(grasps, seed, 2)).grasps
-    found = found[found.payload.isfinite()]  # what has settled
-    if not len(found):
+    if config.finish.settle is None:
+        raise ValueError("payloads are of settled grasps; the configuration settles none")
+    rules, asked = config.finish.settle, config.finish.settle.weight
+    light = replace(rules, weight=WeightConfig(margin=0.0, pull=0.0))  # the squeeze without the weight is what others add to
+    predictor = GraspPredictor(config=replace(config, finish=replace(config.finish, settle=light, weigh=None)))
+    problem = GraspProblem(load_hand(hand_name), load_object(object_name))
+    try:
+        free = predictor.run(problem, GraspRequest(grasps, seed, 2)).grasps
+    except NoGraspError:
         return
-    (part, rollout), = rollouts(scene_of(hand, obj, found, "carry"), hand, found, workers=1)
-    closed, contacts, weight = rollout.close(), contact_forces(rollout), WeightConfig()
-    joints = torch.from_numpy(rollout.poses()[0]).float()
-    clock = [time.process_time()]
-    chosen = squeezes_of(hand, contacts, joints, part.squeeze_joints, weight)
-    shift, turn = (torch.from_numpy(x).float() for x in (closed.shift(rollout.start), closed.turn(rollout.start)))
-    predicted = payloads(chosen, shift, turn, weight.payload)
+    free = free[free.payload.isfinite()]  # what has settled
+    if not len(free):
+        return
+    pair, clock = ready(problem, free, asked), [time.process_time()]
+    pressed = press(problem.hand, problem.obj, free, "carry", config=asked, workers=1)
+    state, _ = grasp_state(problem.hand, problem.obj, pressed, "carry", config=asked, workers=1)
+    told = pressed.replace(payload=observed(pressed.payload, state.gave, problem.obj.mass))
     clock.append(time.process_time())
-    grown = weighed(rollout, chosen, predicted, weight.payload)
+    found = weigh_settled(problem, told, WeighingConfig(), rules)
     clock.append(time.process_time())
-    program = largest_payloads(chosen, weight.payload)
+    program = largest_payloads(pair.chosen, asked.payload)
     clock.append(time.process_time())
-    pair = Pair(rollout.scene, part, chosen)
     truth, again = (pair.by_trials(*interval) for interval in INTERVALS)
-    times = dict(zip(WAYS, 1e3 * np.diff(clock) / len(part), strict=False))
-    for row in zip(predicted, grown, program, again, truth, strict=True):
+    times = dict(zip(WAYS, 1e3 * np.diff(clock) / len(free), strict=False))
+    for row in zip(told.payload, found, program, again, truth, strict=True):
         yield {"hand": hand_name, "object": object_name, **dict(zip((*WAYS, "trials"), map(float, row), strict=True)),
                **{f"{way} [ms]": float(t) for way, t in times.items()}}
+
+
+def ready(problem: GraspProblem, grasps: GraspBatch, config: WeightConfig) -> Pair:
+    """Grasps that squeeze for no weight yet, ready to squeeze for any."""
+    (part, rollout), = rollouts(scene_of(problem.hand, problem.obj, grasps, "carry"), problem.hand, grasps, workers=1)
+    rollout.close()
+    joints = torch.from_numpy(rollout.poses()[0]).float()
+    return Pair(rollout.scene, part, squeezes_of(problem.hand, contact_forces(rollout), joints, part.squeeze_joints, config))
 
 
 def summary(rows: list[dict[str, float | str]]) -> list[list[object]]:

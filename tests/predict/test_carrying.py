@@ -14,12 +14,13 @@ from dro_grasp.objects.shape import DENSITY, solid_of, with_mass
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, settle_best, settle_grasps, weight_config
+from dro_grasp.predict.settling import SettleConfig, settle_best, settle_grasps, weigh_settled, weight_config
 from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.forces import find_forces
 from dro_grasp.simulation.grasp_state import WeightConfig
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import object_mass
+from dro_grasp.simulation.weighing import WeighingConfig
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND, CAN = loaded_hand("gripper3"), dro.load_object("can")
@@ -97,3 +98,17 @@ def test_what_cannot_carry_the_mass_scores_less(grasps: dro.GraspBatch) -> None:
         GraspProblem(HAND, CAN), GraspProblem(HAND, with_mass(CAN, 8.0))))
     assert float(light.max()) > 0.9
     assert float(heavy.max()) < 0.2, "8 kg are too much for three fingers of 1 Nm"
+
+
+def test_what_held_the_mass_as_it_settled_carries_it_at_least(grasps: dro.GraspBatch) -> None:
+    for mass in (None, 1.5):
+        obj = CAN if mass is None else with_mass(CAN, mass)
+        found, stable, known = settle_grasps(GraspProblem(HAND, obj), grasps)
+        payload, rows = found.payload[stable], torch.isin(known.rows, stable.nonzero()[:, 0]) if hasattr(known, "rows") else stable
+        rules, gave = PROTOCOLS["carry"], known.state.gave[rows]
+        held = (gave[:, 0] < rules.max_displacement) & (gave[:, 1] < rules.max_rotation)
+        assert torch.equal(payload >= torch.tensor(obj.mass, dtype=payload.dtype), held)
+        before = found[stable].payload
+        weighed = weigh_settled(GraspProblem(HAND, obj), found[stable], WeighingConfig(), SettleConfig())
+        assert torch.equal(weighed >= torch.tensor(obj.mass, dtype=payload.dtype), held)
+        assert not torch.equal(weighed, before)

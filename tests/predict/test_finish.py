@@ -107,12 +107,12 @@ def test_fingers_leave_room_last() -> None:
     """The pool, its scores and what is compared are of fingers that touch; what is given away leaves room."""
     made, settle = candidates(SEEN), SettleConfig(share=0.25)
     done = finish(SEEN, made, FinishConfig(settle=settle), keep=4)
-    touching = finish(SEEN, made, FinishConfig(settle=settle, ease=None), keep=4)
+    touching = finish(SEEN, made, FinishConfig(settle=settle, weigh=None, ease=None), keep=4)
     same(done.pool, touching.pool)
     same(touching.grasps, done.pool.sorted_by_score()[:4])
-    same(done.grasps, ease(SEEN, touching.grasps))
+    same(done.grasps.replace(payload=touching.grasps.payload), ease(SEEN, touching.grasps))
     assert not torch.equal(done.grasps.joints, touching.grasps.joints)
-    wide = finish(SEEN, made, FinishConfig(settle=settle, ease=EasingConfig(clearance=0.02)), keep=4)
+    wide = finish(SEEN, made, FinishConfig(settle=settle, weigh=None, ease=EasingConfig(clearance=0.02)), keep=4)
     same(wide.grasps, ease(SEEN, touching.grasps, EasingConfig(clearance=0.02)))
 
 

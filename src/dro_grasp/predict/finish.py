@@ -1,4 +1,4 @@
-"""What becomes of candidates, whoever proposed them: refined, admitted, scored, settled, chosen and eased, in one function.
+"""What becomes of candidates, whoever proposed them: refined, admitted, scored, settled, chosen, weighed, eased.
 
 Measurements say that this does most of the work, so predictor, benchmark and arm share it. No trial decides here.
 """
@@ -22,9 +22,10 @@ from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violation
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
-from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
+from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best, weigh_settled
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
+from dro_grasp.simulation.weighing import WeighingConfig
 
 LEAST_CONFIDENCE = 0.2
 """Grasps that hold with less probability are not returned. Ours: see the notebook of `carry` for what other values cost."""
@@ -43,6 +44,8 @@ class FinishConfig(Checked):
     """How grasps are ranked."""
     settle: SettleConfig | None = field(default_factory=SettleConfig)
     """Simulated closing of the better share; a hand without its description cannot settle."""
+    weigh: WeighingConfig | None = field(default_factory=WeighingConfig)
+    """How payloads of what is returned are found in simulation; without it they are predicted."""
     ease: EasingConfig | None = field(default_factory=EasingConfig)
     """Room that fingers leave on a bare cloud."""
 
@@ -57,7 +60,7 @@ class FinishConfig(Checked):
     @staticmethod
     def nothing() -> FinishConfig:
         """Candidates as they come, scored and admitted alone."""
-        return FinishConfig(refine=None, settle=None, ease=None, least_confidence=0.0)
+        return FinishConfig(refine=None, settle=None, weigh=None, ease=None, least_confidence=0.0)
 
 
 def check_confidence(least: float) -> None:
@@ -109,8 +112,10 @@ class Finished:
 
     @cached_property
     def grasps(self) -> GraspBatch:
-        """The best, complete and eased, as they are returned."""
-        best = self.problem.on_table(self.pool[self.rows])
+        """The best, complete, weighed and eased, as they are returned."""
+        best, settling = self.problem.on_table(self.pool[self.rows]), self.config.settle
+        if self.config.weigh is not None and settling is not None and bool(best.payload.isfinite().any()):
+            best = best.replace(payload=weigh_settled(self.problem, best, self.config.weigh, settling))
         return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
 
     @property

@@ -31,6 +31,7 @@ from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed
 from dro_grasp.simulation.trial import hand_shift, settle
+from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
 
 AWAY = "push it away as they close"  # The object is lost at the first closing
 DEEP = "reach into it"  # The hand is too deep in the object, or in itself
@@ -172,10 +173,27 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force,
-                            payload=done.payloads(holds & ~gives_way(state), asked.payload))
+    payload = done.payloads(holds & ~gives_way(state), asked.payload)
+    better = better.replace(
+        squeeze_torque=squeeze.torque, squeeze_force=squeeze.force,
+        payload=observed(payload, state.gave, asked.pull * obj.mass, config.protocol))
     known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), state)
     return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
+
+
+def weigh_settled(
+    problem: GraspProblem, grasps: GraspBatch, config: WeighingConfig, settling: SettleConfig
+) -> Float[Tensor, " n"]:
+    """Payloads of settled grasps, weighed in simulation [kg].
+
+    What held the object's mass as it settled carries that at least, and what gave way carries less.
+    """
+    asked = weight_config(problem, settling)
+    found = weigh(problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config)
+    if asked.pull == 0:
+        return found
+    pulled, before = asked.pull * problem.solid.mass, grasps.payload
+    return torch.where(before < pulled, found.clamp_max(LESS * pulled), found.clamp_min(pulled))
 
 
 def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:

@@ -1,7 +1,7 @@
 """Forces of closed hands: what presses where, what joints exert, and what mass each grasp carries.
 
-Three answers to the last. What a squeezing hand holds by itself is predicted (see `payload`), or weighed in simulation,
-where the mass grows. A linear program says what the contacts as they are allow at most, with forces that suit each direction
+Three answers to the last. What a squeezing hand holds by itself is predicted (see `payload`), or weighed in simulation (see
+`weighing`). A linear program says what the contacts as they are allow at most, with forces that suit each direction
 of gravity. Source of the program: Kerr and Roth 1986, with gravity from all sides; ours otherwise.
 """
 
@@ -28,12 +28,7 @@ from dro_grasp.simulation.pressure import ContactForces, contact_forces
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
-
-SPAN = 4.0  # Least and largest mass that is weighed, as a factor of the predicted payload (ours)
-STAGES = 28  # Stages in which the mass grows (ours)
-STAGE = 0.02  # Duration of each [s] (ours)
-LAG = 1.45
-"""By what factor the mass has grown until an object that gives way has moved. Ours: fitted on training hands and objects."""
+from dro_grasp.simulation.weighing import weighed
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ def find_forces(
         grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
         protocol: Physics of the closing.
         config: How grasps squeeze for a weight.
-        weigh: Let the mass grow in simulation, instead of predicting the payload: nearer to what trials say, in 20 times the
+        weigh: Try a few masses in simulation, instead of predicting the payload: nearer to what trials say, in ten times the
             time.
         workers: Threads; all cores by default.
 
@@ -106,30 +101,8 @@ def _forces(rollout: Rollout, grasps: GraspBatch, config: WeightConfig, weigh: b
     shift, turn = (torch.from_numpy(x).to(joints) for x in (closed.shift(begin), closed.turn(begin)))
     payload = payloads(chosen, shift, turn, config.payload)
     if weigh:
-        payload = weighed(rollout, chosen, payload, config.payload)
+        payload = weighed(rollout, chosen, payload, config)
     return GraspForces(before, after, weak, firm, payload, largest_payloads(chosen, config.payload).to(payload))
-
-
-def weighed(
-    rollout: Rollout, chosen: Squeezes, guess: Float[Tensor, " n"], config: PayloadConfig
-) -> Float[Tensor, " n"]:
-    """The mass at which each closed hand lets go while it grows, along the worst of six directions [kg].
-
-    The hand squeezes for the mass as it grows, from a share of the guess to a multiple of it.
-    """
-    guess = guess.clamp(config.least * SPAN, config.most / SPAN)
-    closed, least = rollout.moment(), SPAN * guess.numpy()
-    for axis in FORCES:
-        rollout.go_back(closed)
-        held = np.ones(rollout.size, bool)
-        for mass in torch.logspace(-1, 1, STAGES).to(guess)[:, None] ** np.log10(SPAN) * guess:
-            targets = chosen.targets(mass[:, None])[:, 0].numpy()[:, rollout.scene.actuated]
-            now = rollout.load(targets, GRAVITY * mass.double().numpy()[:, None] * axis, STAGE)
-            gone = (now.shift(rollout.start) > config.give) | (now.turn(rollout.start) > config.turn) | ~now.stable
-            least = np.where(held & gone, np.minimum(least, mass.numpy()), least)
-            held &= ~gone
-    rollout.go_back(closed)
-    return (torch.from_numpy(least).to(guess) / LAG).clamp_max(config.most)
 
 
 def largest_payloads(chosen: Squeezes, config: PayloadConfig) -> Float[Tensor, " n"]:

@@ -191,6 +191,25 @@ class Rollout:
         for name, values in moment.items():
             self.batch.bind(name)[:] = values
 
+    def pull(
+        self, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], seconds: float,
+        begin: dict[str, Float[np.ndarray, "n m"]] | None = None,
+    ) -> ObjectState:
+        """Let a force on each object, as of `load`, act in some of the trials for a time [s], from a moment if one is given."""
+        for name, values in (begin or {}).items():
+            self.batch.bind(name)[rows] = values[rows]
+        self.force[rows, self.scene.object_body, :3] = np.einsum("nij,nj->ni", self.start.rotation[rows], force)
+        self._advance(rows, self._steps(seconds))
+        return self.observe(rows)
+
+    def make_heavy(self, mass: Float[np.ndarray, " n"]) -> None:
+        """Give each object another mass [kg], and inertia in proportion; go back to a moment afterwards."""
+        factor = mass / self.mass
+        self.batch.expand("body_mass")[:, self.scene.object_body] *= factor
+        self.batch.expand("body_inertia")[:, self.scene.object_body] *= factor[:, None]
+        self.batch.set_const()
+        self.mass = mass.copy()
+
     def push(
         self, closed: ObjectState, alive: Bool[np.ndarray, " n"], pulls: Pulls | None = None
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:

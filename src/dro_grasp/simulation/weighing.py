@@ -1,0 +1,187 @@
+"""Weigh grasps: the largest mass that a closed hand holds in simulation while it squeezes for it.
+
+A trial for each of many masses would take too long. Here the hand closes once, and the object is pulled as each of a few masses
+would, for a fifth of the time of a trial. How fast it moves then tells what it would still move. Ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
+from dro_grasp.simulation.outcome import FORCES
+from dro_grasp.simulation.payload import GRAVITY, Squeezes
+from dro_grasp.simulation.pressure import contact_forces
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
+from dro_grasp.simulation.rollout import Rollout, rollouts
+from dro_grasp.simulation.scene import scene_of
+
+Moment = dict[str, Float[np.ndarray, "n k"]]  # As of `Rollout.moment`
+LESS = 0.95  # Share of a mass that gave way, which its grasp may still carry (ours)
+NOT_HELD = 1e3  # Share of what an object may move that one has used whose simulation is unsound (ours)
+
+
+@dataclass(frozen=True)
+class WeighingConfig(Checked):
+    """How grasps are weighed (ours)."""
+
+    rounds: int = 4
+    """Masses that are tried."""
+    beyond: float = 1.5
+    """The first of them, as a multiple of the predicted payload: it shows which directions are the worst."""
+    step: float = 1.7
+    """Factor between two masses, until one is held and one is not; then their geometric mean is tried."""
+    pressing: float = 0.05
+    """Time in which the hand takes to the squeeze for a mass [s]."""
+    pulling: float = 0.2
+    """Time of each pull [s]."""
+    going_on: float = 0.2
+    """Time for which the object would go on as fast as in the second half of a pull [s]."""
+
+
+def weigh(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None,
+) -> Float[Tensor, " n"]:
+    """Payloads of grasps that state one, weighed in simulation [kg].
+
+    Each hand closes with its squeeze, which is made for the object's mass. Errors are those of `simulate`.
+
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object.
+        grasps: Grasps with payloads, from which the search begins; NaN stays NaN.
+        protocol: Physics, and how far the object may move.
+        weight: How grasps squeeze for a mass.
+        config: How they are weighed.
+        workers: Threads; all cores by default.
+    """
+    weight, config, found = weight or WeightConfig(), config or WeighingConfig(), grasps.payload.clone()
+    rows = found.isfinite().nonzero()[:, 0]
+    begin = 0
+    for part, rollout in rollouts(scene_of(hand, obj, grasps, protocol), hand, grasps[rows], workers):
+        rollout.close()
+        joints = torch.from_numpy(rollout.poses()[0]).to(part.joints)
+        chosen = squeezes_of(hand, contact_forces(rollout), joints, part.squeeze_joints, weight)
+        made_for = torch.from_numpy(rollout.mass).to(joints)
+        found[rows[begin:begin + len(part)]] = weighed(rollout, chosen, part.payload, weight, config, made_for)
+        begin += len(part)
+    return found
+
+
+def observed(
+    payload: Float[Tensor, " n"], gave: Float[Tensor, "n 2"], mass: float, protocol: str | Protocol = DEFAULT_PROTOCOL
+) -> Float[Tensor, " n"]:
+    """Payloads that agree with what a mass did [kg]: what held it carries at least as much, and what gave way less.
+
+    Args:
+        payload: Payloads [kg].
+        gave: How far the mass moved [m] and turned [rad] the object; NaN where that was not tried.
+        mass: The mass that pulled [kg].
+        protocol: How far an object may move.
+    """
+    rules = find_protocol(protocol)
+    held = (gave[:, 0] < rules.max_displacement) & (gave[:, 1] < rules.max_rotation)
+    clamped = torch.where(held, payload.clamp_min(mass), payload.clamp_max(LESS * mass))
+    return torch.where(gave.isnan().any(1), payload, clamped)
+
+
+def weighed(
+    rollout: Rollout, chosen: Squeezes, guess: Float[Tensor, " n"], weight: WeightConfig | None = None,
+    config: WeighingConfig | None = None, made_for: Float[Tensor, " n"] | float = 0.0,
+) -> Float[Tensor, " n"]:
+    """The largest mass that each closed hand holds along each of FORCES [kg]; 0 where none is.
+
+    Args:
+        rollout: Closed hands; they are closed again afterwards.
+        chosen: How they squeeze in addition for a mass.
+        guess: Mass that is tried first [kg].
+        weight: Bounds of payloads.
+        config: Which masses are tried, and how.
+        made_for: Mass for which the base of `chosen` squeezes already [kg].
+    """
+    bounds, config, closed = (weight or WeightConfig()).payload, config or WeighingConfig(), rollout.moment()
+    own = rollout.mass.copy()
+    least, most = math.log(bounds.least), math.log(bounds.most)
+    at = (config.beyond * guess.double()).clamp(bounds.least, bounds.most).log().numpy()
+    low, high, tried = np.full(len(at), -np.inf), np.full(len(at), np.inf), _Tried.nothing(len(at))
+    for _ in range(config.rounds):
+        mass = np.exp(at)
+        targets = chosen.targets((torch.from_numpy(mass).to(guess) - made_for)[:, None])[:, 0].numpy()
+        rollout.make_heavy(mass)  # a light object would move at once where a heavy one has hardly begun to
+        rollout.go_back(closed)
+        rollout.press(targets[:, rollout.scene.actuated], config.pressing)
+        held = _pull(rollout, mass, tried, np.isinf(high), config)
+        low, high = np.where(held, np.maximum(low, at), low), np.where(held, high, np.minimum(high, at))
+        at = _next(low, high, config.step).clip(least, most)
+    rollout.make_heavy(own)
+    rollout.go_back(closed)
+    none = np.isinf(low) & (high <= least + math.log(config.step))
+    found = np.where(none, 0.0, np.exp(_next(low, high, math.sqrt(config.step)).clip(least, most)))
+    return torch.from_numpy(found).to(guess)
+
+
+def _next(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, " n"]:
+    """Between a logarithm that is held and one that is not; a step beyond where one of them is not known."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isinf(high), low + math.log(step), np.where(np.isinf(low), high - math.log(step), (low + high) / 2))
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """What is known of each direction, for n grasps; it is written to."""
+
+    used: Float[np.ndarray, "n 6"]  # share of what the object may move that it used last
+    held: Float[np.ndarray, "n 6"]  # largest mass that was held [kg]
+
+    @staticmethod
+    def nothing(n: int) -> _Tried:
+        return _Tried(np.zeros((n, len(FORCES))), np.zeros((n, len(FORCES))))
+
+
+def _pull(
+    rollout: Rollout, mass: Float[np.ndarray, " n"], tried: _Tried, thorough: Bool[np.ndarray, " n"], config: WeighingConfig
+) -> Bool[np.ndarray, " n"]:
+    """Which masses are held whichever way they pull.
+
+    What was held in a direction is not tried there with less. The first mass that is not held is tried in all directions, so
+    that few are left; after it the worst come first, and the first failure ends the round.
+    """
+    begin, held = rollout.moment(), np.ones(len(mass), bool)
+    order = np.argsort(-tried.used, 1, kind="stable")
+    for k in range(order.shape[1]):
+        axis = order[:, k]
+        known = tried.held[np.arange(len(mass)), axis] >= mass
+        rows = np.flatnonzero((held | thorough) & ~known)
+        if not len(rows):
+            continue
+        used = _used(rollout, rows, GRAVITY * mass[rows, None] * FORCES[axis[rows]], begin, config)
+        tried.used[rows, axis[rows]] = used
+        tried.held[rows, axis[rows]] = np.where(used < 1, mass[rows], tried.held[rows, axis[rows]])
+        held[rows] &= used < 1
+    return held
+
+
+def _used(
+    rollout: Rollout, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], begin: Moment, config: WeighingConfig
+) -> Float[np.ndarray, " k"]:
+    """Share of what the protocol lets an object move that a force [N] uses."""
+    rules, start = rollout.scene.protocol, rollout.start.rows(rows)
+    half = rollout.pull(rows, force, config.pulling / 2, begin)
+    now = rollout.pull(rows, force, config.pulling / 2)
+    share = config.going_on / (config.pulling / 2)
+    moved, turned = (
+        after + share * np.maximum(after - before, 0)
+        for before, after in ((half.shift(start), now.shift(start)), (half.turn(start), now.turn(start))))
+    used = np.maximum(moved / rules.max_displacement, turned / rules.max_rotation)
+    return np.where(now.stable & np.isfinite(used), used, NOT_HELD)

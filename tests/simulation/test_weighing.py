@@ -1,0 +1,89 @@
+"""Weighing beside trials with each mass, and payloads beside what a mass did."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import complete
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel, with_mass
+from dro_grasp.simulation.grasp_state import WeightConfig
+from dro_grasp.simulation.payload import PayloadConfig
+from dro_grasp.simulation.protocols import CARRY
+from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
+from tests.helpers.claw import ball, claw, power_grasp
+
+NOTHING_ADDED = WeightConfig(margin=0.0)
+FINE = WeighingConfig(rounds=8)
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    return claw(tmp_path_factory.mktemp("hand"))
+
+
+@pytest.fixture(scope="module")
+def obj() -> ObjectModel:
+    return ball()
+
+
+@pytest.fixture(scope="module")
+def grasps(hand: Hand, obj: ObjectModel) -> GraspBatch:
+    """Three grasps that press more and more, with a guess of 0.5 kg."""
+    made = complete(hand, power_grasp(hand, obj, 3), torch.zeros(3))
+    share = torch.tensor([0.3, 0.6, 1.0])[:, None]
+    squeeze = made.joints + share * (made.squeeze_joints - made.joints)
+    return made.replace(squeeze_joints=squeeze, payload=torch.full((3,), 0.5))
+
+
+def by_trials(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> torch.Tensor:
+    """The largest mass that holds in trials with the squeeze as it is, by halving each grasp's interval."""
+    found = []
+    for i in range(len(grasps)):
+        low, high = math.log(0.01), math.log(20.0)
+        for _ in range(7):
+            middle = (low + high) / 2
+            held = bool(simulate(hand, with_mass(obj, math.exp(middle)), grasps[[i]], CARRY).success)
+            low, high = (middle, high) if held else (low, middle)
+        found.append(math.exp((low + high) / 2))
+    return torch.tensor(found)
+
+
+def test_weighing_says_what_trials_say(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
+    truth = by_trials(hand, obj, grasps)
+    assert float(truth.max() / truth.min()) > 1.3, "the grasps differ"
+    found = weigh(hand, obj, grasps, weight=NOTHING_ADDED, config=FINE)
+    assert found.tolist() == pytest.approx(truth.tolist(), rel=0.25)
+    for guess in (0.05, 5.0):
+        other = weigh(hand, obj, grasps.replace(payload=torch.full((3,), guess)), weight=NOTHING_ADDED, config=FINE)
+        assert other.tolist() == pytest.approx(truth.tolist(), rel=0.3), "wherever the search begins"
+
+
+def test_company_and_unknown_payloads_change_nothing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
+    together = weigh(hand, obj, grasps)
+    partly = weigh(hand, obj, grasps.replace(payload=torch.tensor([0.5, math.nan, 0.5])))
+    assert partly.isnan().tolist() == [False, True, False]
+    assert torch.equal(partly[[0, 2]], together[[0, 2]])
+    assert weigh(hand, obj, grasps[:0]).shape == (0,)
+
+
+def test_payloads_stay_within_bounds(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
+    away = grasps.replace(squeeze_joints=grasps.pregrasp_joints)
+    assert weigh(hand, obj, away, weight=NOTHING_ADDED, config=WeighingConfig(rounds=12)).tolist() == [0, 0, 0]
+    weak = replace(NOTHING_ADDED, payload=PayloadConfig(most=0.05))
+    assert weigh(hand, obj, grasps, weight=weak).tolist() == pytest.approx([0.05] * 3)
+
+
+def test_payloads_agree_with_what_a_mass_did() -> None:
+    limit, turn = CARRY.max_displacement, CARRY.max_rotation
+    gave = torch.tensor([[0.5 * limit, 0.5 * turn], [0.5 * limit, 2 * turn], [2 * limit, 0.0], [math.nan, math.nan]])
+    gave = gave.repeat(2, 1)
+    payload = torch.tensor([0.1] * 4 + [0.9] * 4)
+    expected = [0.3, 0.1, 0.1, 0.1, 0.9, LESS * 0.3, LESS * 0.3, 0.9]
+    assert observed(payload, gave, 0.3).tolist() == pytest.approx(expected)
