@@ -197,3 +197,13 @@ def test_changes_of_code_count_as_uncommitted_and_results_do_not(tmp_path: Path,
     (tmp_path / "src/a.py").write_text("2\n")
     (tmp_path / "lab/new.py").write_text("2\n")
     assert sorted(runner.uncommitted()) == ["lab/new.py", "src/a.py"]
+
+
+def test_the_error_of_payloads_is_the_median_of_what_trials_held(tmp_path: Path) -> None:
+    rows = [{"trials": t, "weighed": w, "trials again": a} for t, w, a in
+            ((1.0, 1.1, 1.02), (2.0, 1.0, 2.0), (0.5, 0.6, 0.55), (0.01, 3.0, 0.01))]
+    cells = {name: {"command": command, "result": {"rows": rows}} for name, command in MEASUREMENTS["payload"].cells.items()}
+    (tmp_path / "payload.json").write_text(json.dumps({"cells": cells}))
+    told = tables.payload_error(tables.Results(tmp_path))
+    count = len(cells)
+    assert told == f"20 % in the median of {3 * count} grasps (trials repeated: 2 %; {count} more held no mass in trials)"
