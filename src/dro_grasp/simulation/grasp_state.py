@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -107,10 +109,15 @@ def grasp_state(
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
         parts.append(replace(state, gave=_pulled(rollout, closed, config)))
-    state, squeeze = (
-        type(many[0])(**{f.name: torch.cat([getattr(one, f.name) for one in many]) for f in fields(many[0])})
-        for many in (parts, squeezes))
-    return state, squeeze
+    return join(parts), join(squeezes)
+
+
+T = TypeVar("T", GraspState, Squeeze)
+
+
+def join(parts: Sequence[T]) -> T:
+    """States or squeezes of several batches, one after another."""
+    return type(parts[0])(**{f.name: torch.cat([getattr(one, f.name) for one in parts]) for f in fields(parts[0])})
 
 
 def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
