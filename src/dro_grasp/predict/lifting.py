@@ -19,9 +19,8 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.grasp_state import GraspState, Squeeze, WeightConfig, grasp_state, join, press
 from dro_grasp.simulation.protocols import protocol as find_protocol
 
-
 MARGIN = 1.5
-"""Multiple of the weight for which proposed pinches press; with another margin they press harder or softer. Source: PinchConfig."""
+"""Multiple of the weight for which proposed pinches press; with another margin they press otherwise. Source: PinchConfig."""
 
 
 @dataclass(frozen=True)
