@@ -113,6 +113,7 @@ def grasp_state(
 
 
 T = TypeVar("T", GraspState, Squeeze)
+"""Either kind of rows."""
 
 
 def join(parts: Sequence[T]) -> T:
