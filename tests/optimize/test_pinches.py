@@ -14,7 +14,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.contacts import tip_links
-from dro_grasp.optimize.pinches import Pairs, PinchConfig, PinchEnergy, PinchSearch, _taking, opposed_pairs
+from dro_grasp.optimize.pinches import Pairs, PinchConfig, PinchEnergy, PinchSearch, _taking, opposed_pairs, pads_of
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig, pinch
@@ -115,7 +115,7 @@ def test_the_slope_is_that_of_the_energy() -> None:
     far = torch.tensor([[0.3, 0.3, 0.5]]).repeat(6, 1)  # away from the object and the table: nothing else acts
     axis = torch.nn.functional.normalize(torch.randn(6, 3, generator=generator), dim=-1)
     pairs = Pairs(far, axis, torch.full((6,), 0.02), torch.zeros(6))
-    slope = PinchEnergy(energy, hands.pads, pairs, PinchConfig())
+    slope = PinchEnergy(search.energy, hands.pads, pairs, PinchConfig())
     T = search._placed(hands, pairs)[0]
     still = slope(T, hands.q, hands.pads)
     others = [index for index in range(6) if index not in (1, 4)]
@@ -129,3 +129,13 @@ def test_the_slope_is_that_of_the_energy() -> None:
     shift[:, 0, 3] = 1e-4
     rise = (slope(shift @ T, hands.q, hands.pads).total - slope(torch.linalg.inv(shift) @ T, hands.q, hands.pads).total) / 2e-4
     assert torch.allclose(rise, still.by_pose[:, 0], rtol=0.03, atol=2.0)
+
+
+def test_more_points_of_tips_are_pads_than_other_contacts() -> None:
+    hand = load_hand("leaphand")
+    energy = GraspProblem(hand, rod(), constraints=Constraints(DOWN, table=0.0)).energy(OptimiserConfig().synthesis.energy)
+    pads, before = pads_of(energy, 0.0), energy.candidates
+    assert {tuple(p) for p in before.points.tolist()} <= {tuple(p) for p in pads.points.tolist()}
+    for link in tip_links(hand):
+        assert int((pads.links == link).sum()) > int((before.links == link).sum()) > 0
+    assert torch.equal(pads.fingers, hand.finger_of_link[pads.links])

@@ -278,6 +278,13 @@ class GraspEnergy:
         other._weigh(config)
         return other
 
+    def touching(self, candidates: ContactCandidates) -> GraspEnergy:
+        """This energy with other contact candidates."""
+        other = copy(self)
+        other.candidates = candidates
+        other.contact_points = LinkPoints.of(candidates.points, candidates.links, self.hand.tree.n_links)
+        return other
+
     def _weigh(self, config: EnergyConfig) -> None:
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)

@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import Rows
+from dro_grasp.devices import Rows, on_device
 from dro_grasp.geometry.se3 import apply, compose, roma, rotate
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize import terms as energies
-from dro_grasp.optimize.contacts import tip_links
+from dro_grasp.optimize.contacts import ContactCandidates, ContactConfig, contact_candidates, tip_links
 from dro_grasp.optimize.grasp_energy import TIP_HEIGHT, Evaluation, GraspEnergy
 from dro_grasp.optimize.refinement import RefineConfig, descend_near
 from dro_grasp.optimize.starts import Direction
@@ -45,6 +45,9 @@ class PinchConfig(Checked):
     """Distance from the centre of mass to the line of a pair at which it is drawn 1 / e as often [m], and which costs 1 /2."""
     pairs: int = 8
     """Pairs that are tried for each pinch that is wanted."""
+    inner: float = 0.0
+    """Least cosine between the normal of a tip's point and the direction to the grasp centre, for it to be a pad: tips touch
+    what is thin with their ends, where other grasps have no contacts."""
     bent: float = 0.6
     """How far at most the other fingers are closed [share of the way from open]."""
     narrow: float = 0.08
@@ -201,6 +204,7 @@ class PinchSearch:
     ) -> None:
         """The object's mass [kg], the palm direction, and the largest angle from it [rad]."""
         self.config = config or PinchConfig()
+        energy = energy.touching(pads_of(energy, self.config.inner))
         self.energy, self.hand, self.mass = energy, energy.hand, mass
         self.tilt = self.config.tilt if max_tilt is None else max_tilt
         self.wanted = None
@@ -415,6 +419,21 @@ def _taking(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "
 def _across(v: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Some vector at right angles to each."""
     return torch.linalg.cross(v, torch.eye(3).to(v)[v.abs().argmin(-1)])
+
+
+def pads_of(energy: GraspEnergy, inner: float) -> ContactCandidates:
+    """The energy's contact candidates, and all points of fingertips that face the grasp centre when half closed."""
+    hand, given = energy.source, contact_candidates(energy.source)
+    points, normals = hand.points_and_normals(hand.canonical_joints(1 - ContactConfig().closing))
+    towards = torch.nn.functional.normalize(hand.grasp_centre_wrist - points, dim=-1)
+    facing = torch.isin(hand.link_index, torch.tensor(tip_links(hand))) & ((normals * towards).sum(-1) > inner)
+    known = (hand.link_points[:, None] == given.points).all(-1) & (hand.link_index[:, None] == given.links)
+    kept = (facing | known.any(1)).nonzero()[:, 0]
+    finger = hand.finger_of_link[hand.link_index]
+    weight = torch.where(facing[kept], 1.0, (known[kept] * given.slot_weights.sum(0)).sum(1))
+    found = ContactCandidates(
+        hand.link_points[kept], hand.link_normals[kept], hand.link_index[kept], finger[kept], weight[None], (PALM,), hand.thumb)
+    return on_device(found, energy.centre.device)
 
 
 def partners(energy: GraspEnergy) -> Float[Tensor, "k 2 n_candidates"]:

@@ -276,6 +276,9 @@ class _Asking:
 
     def _is_hopeless(self, before: Finished, done: Finished, least_score: float) -> bool:
         """Whether nothing is trusted so far, and a round brought nothing better."""
+        # Scores of pinches that do not lift tell nothing of those to come.
+        if self.problem.lies_flat and not len(done.rows):
+            return True
         gained = done.best_mean - before.best_mean >= self.config.rescue.least_gain
         return not gained and done.lacking(least_score) == self.request.num
 

@@ -24,12 +24,13 @@ from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, feasible
+from dro_grasp.predict.lifting import LiftConfig, lifted
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, gives_way, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed
+from dro_grasp.simulation.grasp_state import GraspState, Squeeze, WeightConfig, grasp_state, pressed
 from dro_grasp.simulation.trial import hand_shift, settle
 from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
 
@@ -72,6 +73,8 @@ class SettleConfig(Checked):
     """Time of each pull on what lies flat on a table [s], as in a trial: pinches turn slowly."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """Which squeezes are tried on what lies flat on a table."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined after the first closing, and how settled ones squeeze."""
 
@@ -149,7 +152,8 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
     forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
     grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was. Payloads
-    are of those that hold and do not give way under the weight.
+    are of those that hold and do not give way under the weight. What lies flat on a table is closed on from where the grasp
+    is, with several squeezes.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -161,6 +165,8 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     """
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
     grasps = problem.on_table(complete(problem, grasps.without("score")))
+    if problem.lies_flat:
+        return _lifted(problem, grasps, config)
     closed = settle(hand, obj, grasps, config.closing)
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
@@ -170,13 +176,27 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     done = pressed(hand, obj, better, config.protocol, config=asked)
     better = problem.on_table(done.grasps)
     state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
+    better = better.replace(payload=done.payloads(~gives_way(state), asked.payload))
+    return _judged(problem, grasps, rows, moved, better, state, squeeze, config)
+
+
+def _lifted(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig) -> Settled:
+    """Pinches of what lies flat, where they are: to close, refine and close again moves fingers off something thin."""
+    found, state, squeeze = lifted(problem, grasps, config.protocol, weight_config(problem, config), config.lift)
+    return _judged(problem, grasps, torch.arange(len(grasps)), state.shift, found, state, squeeze, config)
+
+
+def _judged(
+    problem: GraspProblem, grasps: GraspBatch, rows: Int[Tensor, " k"], moved: Float[Tensor, " n"], better: GraspBatch,
+    state: GraspState, squeeze: Squeeze, config: SettleConfig,
+) -> Settled:
+    """The grasps, of these rows the better ones that hold still, and what closing showed."""
+    hand, obj = problem.hand, problem.solid
     depth = deepest_penetration(hand, obj, better, config.protocol)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
-    stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    payload = done.payloads(holds & ~gives_way(state), asked.payload)
-    better = better.replace(
-        squeeze_torque=squeeze.torque, squeeze_force=squeeze.force,
-        payload=observed(payload, state.gave, asked.pull * obj.mass, config.protocol))
+    stable = torch.zeros_like(moved, dtype=torch.bool).index_fill(0, rows[holds], True)
+    payload = observed(better.payload, state.gave, config.weight.pull * obj.mass, config.protocol)
+    better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force, payload=payload)
     known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), state)
     return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
 
@@ -206,20 +226,9 @@ def _bettered(
     config: SettleConfig,
 ) -> GraspBatch:
     """Closed grasps that squeeze with balanced forces, or are refined where closing moved the object."""
-    if problem.lies_flat:
-        return as_before(closed, grasps)
     again = near & ~still
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     return replaced(better, again, refine(problem, closed[again], config.refinement))
-
-
-def as_before(closed: GraspBatch, grasps: GraspBatch) -> GraspBatch:
-    """Closed grasps that open and press by as much as the grasps that they were.
-
-    What lies flat is thinner than the distances know that refinement goes by: it would move fingers off what they found.
-    """
-    postures = {name: closed.joints + getattr(grasps, name) - grasps.joints for name in ("pregrasp_joints", "squeeze_joints")}
-    return closed.replace(**postures)
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:

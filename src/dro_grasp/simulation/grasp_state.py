@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dro_grasp.devices import Record, Rows
+from dro_grasp.devices import Rows
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -138,13 +140,16 @@ def grasp_state(
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
         parts.append(replace(state, gave=_pulled(rollout, closed, config)))
-    return _joined(parts), _joined(squeezes)
+    return join(parts), join(squeezes)
 
 
-def _joined(parts: list[Record]) -> Record:
-    """The rows of all parts, one below the other."""
-    names = [f.name for f in fields(parts[0])]  # type: ignore[arg-type]
-    return type(parts[0])(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+Held = TypeVar("Held", GraspState, Squeeze)
+"""Either kind of rows."""
+
+
+def join(parts: Sequence[Held]) -> Held:
+    """States or squeezes of several batches, one after another."""
+    return type(parts[0])(**{f.name: torch.cat([getattr(one, f.name) for one in parts]) for f in fields(parts[0])})
 
 
 def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
