@@ -80,7 +80,7 @@ FAULTS = (
           "ratio of a mimic joint that follows another mimic joint"),
     Fault("hands/description/tree_reading.py", "ends = sorted((model.jnt_range[joint] - offset[joint]) / c)",
           "ends = sorted(model.jnt_range[joint] / c)", "offset of a follower ignored in the limits of its leader"),
-    Fault("hands/description/loader.py", "(path, *(within[name] for name in sorted(within)))", "(path,)",
+    Fault("hands/description/loader.py", "for file in (path, *sorted(set(files), key=os.fspath)):", "for file in (path,):",
           "hash of a hand without its meshes: a stale key"),
     Fault("hands/kinematics/joint_solver.py", "return state.T @ local, state.q", "return local @ state.T, state.q",
           "step of the wrist in the world's frame instead of its own"),

@@ -145,8 +145,7 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
 
 def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
     digest = hashlib.sha256(b"" if link is None else named("", link).encode())
-    within = {os.path.relpath(file, path.parent): file for file in files}  # the same order wherever the folder lies, links or not
-    for file in (path, *(within[name] for name in sorted(within))):
+    for file in (path, *sorted(set(files), key=os.fspath)):
         digest.update(file.read_bytes())
     return digest.hexdigest()
 

@@ -51,7 +51,7 @@ def parse_xml(path: Path) -> ET.Element:
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
     """Every file that an MJCF includes or attaches, directly or not; HandError: one is missing, or contains itself."""
-    found: dict[Path, Path] = {}
+    found: dict[Path, None] = {}
     waiting: list[tuple[ET.Element, Path, tuple[Path, ...]]] = [(root, path, (path.resolve(),))]
     while waiting:
         element, including, above = waiting.pop()
@@ -65,9 +65,9 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
             if include.tag == "model" and file.resolve() in above:
                 raise HandError(f"{including} attaches '{name}', which contains {including.name} itself; remove the <model>")
             if file.resolve() not in found:
-                found[file.resolve()] = file
+                found[file.resolve()] = None
                 waiting.append((parse_xml(file), file, (*above, file.resolve())))
-    return tuple(found.values())
+    return tuple(found)
 
 
 def _check_elements(root: ET.Element, path: Path) -> None:
