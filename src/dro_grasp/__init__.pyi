@@ -59,6 +59,7 @@ from .predict.sources.network import ProposalConfig as ProposalConfig
 from .predict.sources.optimiser import OptimiserConfig as OptimiserConfig
 from .predict.sources.registry import make_source as make_source, register_source as register_source
 from .predict.sources.source import Candidates as Candidates, Source as Source
+from .predict.sources.variation import VariationConfig as VariationConfig
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .simulation.contacts import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from .simulation.forces import GraspForces as GraspForces, find_forces as find_forces

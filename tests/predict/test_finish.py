@@ -19,7 +19,7 @@ from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violations, feasible
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.finish import HOPELESS, FinishConfig, finish
+from dro_grasp.predict.finish import FinishConfig, finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.settling import SettleConfig, settle_grasps
@@ -171,14 +171,6 @@ def test_what_is_not_trusted_enough_is_not_returned() -> None:
     later = finish(WHOLE, candidates(WHOLE, 4, 2), some.config, 8, some)
     assert later.doubts[:8] == some.doubts
     assert len(later.doubts) == len(later.pool)
-
-
-def test_the_mean_of_the_best_counts_what_is_missing_as_hopeless() -> None:
-    done = finish(WHOLE, candidates(WHOLE, 3), FinishConfig.nothing(), keep=4)
-    best = done.pool.score.clamp_min(HOPELESS).sort(descending=True).values
-    assert done.best_mean == pytest.approx((float(best.sum()) + HOPELESS) / 4, rel=1e-6)
-    two = finish(WHOLE, candidates(WHOLE, 3), FinishConfig.nothing(), keep=2)
-    assert two.best_mean == pytest.approx(float(best[:2].mean()), rel=1e-6)
 
 
 @pytest.mark.parametrize("least", [-0.1, 1.0, math.nan])

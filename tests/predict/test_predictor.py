@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from typing import Never
+from collections import Counter
+from typing import Any, Never
 
 import pytest
 import torch
@@ -19,10 +20,11 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.starts import Spread, wrist_rotations
 from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.predict import predictor as predictor_module
 from dro_grasp.predict.admission import PLANE, TURNED, AdmissionConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig, RetryConfig
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.finish import FinishConfig
+from dro_grasp.predict.finish import FinishConfig, Finished
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
@@ -352,10 +354,13 @@ def test_prediction_runs_wholly_on_the_device_it_is_told(
         torch.testing.assert_close(getattr(there, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
 
-def rescuing(predictor: GraspPredictor, scores: tuple[float, ...], per_grasp: int) -> GraspPredictor:
-    """The predictor with other rounds of a quick optimiser."""
+def rescuing(
+    predictor: GraspPredictor, scores: tuple[float, ...], per_grasp: int, blind: int, patience: int = 1000
+) -> GraspPredictor:
+    """The predictor with other rounds of a quick optimiser; it gives up after `patience` candidates."""
     other = copy.copy(predictor)
-    other.config = PredictorConfig(optimiser=QUICK, rescue=RescueConfig(scores, per_grasp, least_gain=-math.inf))
+    rescue = RescueConfig(scores, per_grasp, blind=blind, patience=patience, hopeless=math.inf)
+    other.config = PredictorConfig(optimiser=QUICK, rescue=rescue)
     return other
 
 
@@ -366,26 +371,52 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
     auto, network = dataclasses.replace(alone, source="auto"), predictor.run(problem, alone)
     assert network.origin == ["network"] * 4
     trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
-    helped = rescuing(predictor, (trusted - 1e-6, -math.inf), 3).run(problem, auto)
+    helped = rescuing(predictor, (trusted - 1e-6, -math.inf), 3, 12).run(problem, auto)
     assert helped.candidates == network.candidates + 3
     assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
-    again = rescuing(predictor, (trusted - 1e-6, math.inf, math.inf), 3).run(problem, auto)
+    again = rescuing(predictor, (trusted - 1e-6, math.inf, math.inf), 3, 12).run(problem, auto)
     assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
     assert bool((again.grasps.score >= helped.grasps.score).all())
-    assert rescuing(predictor, (-math.inf, math.inf), 3).run(problem, auto).candidates == network.candidates
+    assert rescuing(predictor, (-math.inf, math.inf), 3, 12).run(problem, auto).candidates == network.candidates
 
 
-def test_no_round_follows_one_that_brings_nothing(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    """Demands that nothing meets stop after a round that gains too little; the optimiser alone always has a second one."""
-    patient, source = rescuing(predictor, (math.inf,) * 4, 2), Noting()
-    hasty = copy.copy(patient)
-    hasty.config = dataclasses.replace(patient.config, rescue=dataclasses.replace(patient.config.rescue, least_gain=math.inf))
+def test_a_request_is_given_up_once_enough_candidates_are_hopeless(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    """Nothing is near demands that nothing meets; the first rivals are made before that is asked."""
     problem, request = GraspProblem(HAND, ball), GraspRequest(2, seed=1, source="auto")
     network = predictor.run(problem, dataclasses.replace(request, source="network")).candidates
-    assert hasty.run(problem, request).candidates == network + 4
-    assert patient.run(problem, request).candidates == network + 4 * 4
-    hasty.run(problem, dataclasses.replace(request, source=source))
-    assert len(source.asked_for) == 2
+    for patience, rounds in ((0, 1), (network + 5, 2), (1000, 4)):
+        asked = rescuing(predictor, (math.inf,) * 4, 2, 4, patience)
+        assert asked.run(problem, request).candidates == network + 4 * rounds
+    near = rescuing(predictor, (math.inf,) * 4, 2, 4, 0)
+    near.config = dataclasses.replace(near.config, rescue=dataclasses.replace(near.config.rescue, hopeless=-math.inf))
+    assert near.run(problem, request).candidates == network + 4 * 4
+
+
+def test_as_long_as_nothing_is_trusted_rounds_have_a_fixed_size(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    asked, source = rescuing(predictor, (math.inf, math.inf, -math.inf), 2, 7), Noting()
+    asked.run(GraspProblem(HAND, ball), GraspRequest(2, source=source))
+    assert [num for num, _ in source.asked_for] == [4, 7]
+
+
+def test_the_best_candidates_are_varied_where_no_source_is_named(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    """Once both sources brought nothing that is trusted, and then in turn with them; a source by its name is asked alone."""
+    problem, asked = GraspProblem(HAND, ball), rescuing(predictor, (math.inf,) * 3, 20, 40)
+    request = GraspRequest(2, seed=1, source="auto")
+    made: Counter[str] = Counter()
+    finish = predictor_module.finish
+
+    def noting(problem: GraspProblem, candidates: Candidates, *rest: Any) -> Finished:
+        made.update(candidates.origin)
+        return finish(problem, candidates, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(predictor_module, "finish", noting)
+        given = asked.run(problem, request)
+        assert made == {"network": 48, "optimiser": 40, "variation": 40}
+        assert set(given.origin) <= set(made)
+        made.clear()
+        asked.run(problem, dataclasses.replace(request, source="optimiser"))
+        assert made == {"optimiser": 120}
 
 
 class Noting(OptimiserSource):
@@ -401,7 +432,7 @@ class Noting(OptimiserSource):
 
 
 def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    asked, source = rescuing(predictor, (math.inf,) * 3, 2), Noting()
+    asked, source = rescuing(predictor, (math.inf,) * 3, 2, 4), Noting()
     for first in (0, 1, 2, 2**63 - 1):
         asked.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, source=source))
     assert {num for num, _ in source.asked_for} == {4}
@@ -410,8 +441,7 @@ def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(predictor: Gra
 
 def test_in_surroundings_fewer_rivals_are_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
     asked, source = copy.copy(predictor), Noting()
-    rescue = RescueConfig((math.inf,), 3, trusted_in_surroundings=(math.inf, math.inf), per_grasp_in_surroundings=1,
-                          least_gain=-math.inf)
+    rescue = RescueConfig((math.inf,), 3, trusted_in_surroundings=(math.inf, math.inf), per_grasp_in_surroundings=1, blind=2)
     asked.config = PredictorConfig(finish=FinishConfig.nothing(), rescue=rescue)
     for table in (None, -0.1):
         problem = GraspProblem(HAND, ball, constraints=Constraints(table=table))
@@ -428,7 +458,7 @@ def test_candidates_that_turn_away_as_they_are_made_are_counted(predictor: Grasp
         assert (len(made), made.turned) == (8 - turned, turned)
     few = OptimiserSource(dataclasses.replace(QUICK, starts_per_candidate=1, farthest_direction=1e-5))
     with pytest.raises(NoGraspError, match=rf"only 0 of 8 candidates .*8 {TURNED}"):
-        rescuing(predictor, (math.inf,), 4).run(problem, GraspRequest(2, seed=1, source=few))
+        rescuing(predictor, (math.inf,), 4, 8).run(problem, GraspRequest(2, seed=1, source=few))
 
 
 class Deaf(DistanceNetwork):
@@ -439,7 +469,7 @@ class Deaf(DistanceNetwork):
 
 
 def test_the_optimiser_alone_asks_no_network(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    alone = rescuing(predictor, (math.inf, math.inf), 4)
+    alone = rescuing(predictor, (math.inf, math.inf), 4, 8)
     alone.network = Deaf(predictor.network.config)
     with pytest.raises(AssertionError, match="the network was asked"):
         alone.predict(HAND, ball, 1, source="network")

@@ -11,6 +11,7 @@ from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.sources.source import AUTO, Source
+from dro_grasp.predict.sources.variation import VariationConfig
 
 LARGEST_CALL = 100_000  # Most candidates of one call; more do not fit memory
 
@@ -72,20 +73,27 @@ class RetryConfig(Checked):
 
 @dataclass(frozen=True)
 class RescueConfig(Checked):
-    """What is asked again where the score does not trust what there is: whatever source proved better (ours)."""
+    """What is asked again where the score does not trust what there is: whatever source proved better (ours).
 
-    trusted_scores: tuple[float, ...] = (1.5, 1.0, 1.0, 1.0, 1.0, 1.0)
+    The best candidates so far, varied, are a source too where nothing else was asked for by name.
+    """
+
+    trusted_scores: tuple[float, ...] = (1.5, *[1.0] * 7)
     """Log-odds of holding from which on a grasp needs no rival, in each round."""
     per_grasp: int = 8
     """Candidates in a round for each grasp that needs rivals."""
-    trusted_in_surroundings: tuple[float, ...] = (1.5, 0.5)
+    trusted_in_surroundings: tuple[float, ...] = (1.5, 0.5, 0.0, 0.0)
     """Trusted scores where there are surroundings, with which a descent takes longer."""
     per_grasp_in_surroundings: int = 4
     """Candidates in a round where there are surroundings."""
+    blind: int = 64
+    """Candidates in each round but the first as long as nothing is trusted, however many grasps are asked for."""
     untried: int = 32
     """A source that was not asked yet counts like one of whose first candidates, as many, one is trusted."""
-    least_gain: float = 0.2
-    """Where nothing is trusted yet, no further round follows one that raises the mean score of the best by less [log-odds]."""
+    patience: int = 200
+    """Candidates that are made before a request may be given up."""
+    hopeless: float = -7.0
+    """It is given up if none of them scores better [log-odds]."""
 
     def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
         """Trusted score of each round, and candidates for each grasp that needs rivals."""
@@ -102,9 +110,11 @@ class PredictorConfig(Checked):
     """How the network proposes."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     """How the optimiser proposes."""
+    variation: VariationConfig = field(default_factory=VariationConfig)
+    """How the best candidates are varied."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """When a source is asked again."""
     finish: FinishConfig = field(default_factory=FinishConfig)
     """What becomes of candidates."""
     rescue: RescueConfig = field(default_factory=RescueConfig)
-    """When the optimiser helps."""
+    """When rivals are made."""

@@ -29,7 +29,6 @@ from dro_grasp.simulation.weighing import WeighingConfig
 
 LEAST_CONFIDENCE = 0.2
 """Grasps that hold with less probability are not returned. Ours: see the notebook of `carry` for what other values cost."""
-HOPELESS = -4.0  # Scores below this are alike in `best_mean` [log-odds] (ours)
 
 
 @dataclass(frozen=True)
@@ -122,12 +121,6 @@ class Finished:
     def proposed(self) -> Candidates:
         """The best as they were proposed."""
         return self.candidates[self.rows]
-
-    @cached_property
-    def best_mean(self) -> float:
-        """Mean score of the wanted grasps; those that are missing count as HOPELESS."""
-        best = self.pool.score.sort(descending=True).values[: self.keep].clamp_min(HOPELESS)
-        return (float(best.sum()) + HOPELESS * (self.keep - len(best))) / self.keep
 
     def lacking(self, least_score: float) -> int:
         """How many of the wanted grasps are missing, or score no better than `least_score`."""

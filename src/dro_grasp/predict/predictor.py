@@ -34,6 +34,7 @@ from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.sources.source import Progress, Source, ask
+from dro_grasp.predict.sources.variation import VariationSource
 from dro_grasp.predict.stages import complete
 
 PARTS = ("network", "choose", "decode", "optimiser", "refine", "settle", "rank")
@@ -256,31 +257,38 @@ class _Asking:
 
     def until_trusted(self, sources: Sequence[Source]) -> None:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
-        levels, each = self.config.rescue.rounds(self.problem.surroundings is not None and not self.problem.lies_flat)
-        for seed, least_score in zip(_drawn(self.request.seed, len(levels)), levels, strict=True):
+        rescue, flat = self.config.rescue, self.problem.lies_flat
+        levels, each = rescue.rounds(self.problem.surroundings is not None and not flat)
+        for k, (seed, least_score) in enumerate(zip(_drawn(self.request.seed, len(levels)), levels, strict=True)):
             lacking = self.request.num if self.done is None else self.done.lacking(least_score)
             if not lacking:
                 return
-            before = self.done
-            done = self.ask(self._promising(sources, least_score), each * lacking, seed)
-            if before is not None and self._is_hopeless(before, done, least_score):
+            nothing = lacking == self.request.num
+            if k and nothing and self._is_hopeless():
                 return
+            count = rescue.blind if k and nothing else each * lacking
+            self.ask(self._promising(sources, least_score), count, seed)
 
     def _promising(self, sources: Sequence[Source], least_score: float) -> Source:
         """The source of whose candidates the largest share is trusted so far; the first of several."""
-        trusted, untried = Counter[str](), self.config.rescue.untried
-        if self.done is not None:
-            rows = (self.done.pool.score > least_score).nonzero()[:, 0].tolist()
-            trusted.update(self.done.candidates.origin[row] for row in rows)
+        trusted, untried, done = Counter[str](), self.config.rescue.untried, self.done
+        if done is not None:
+            rows = (done.pool.score > least_score).nonzero()[:, 0].tolist()
+            trusted.update(done.candidates.origin[row] for row in rows)
+            # A pinch that does not lift is no nearer to one that does than any other.
+            if self.request.source == AUTO and len(done.pool) and not self.problem.lies_flat:
+                sources = (*sources, VariationSource(done.pool, self.config.variation))
         return max(sources, key=lambda source: (trusted[source.name] + 1) / (self.made[source.name] + untried))
 
-    def _is_hopeless(self, before: Finished, done: Finished, least_score: float) -> bool:
-        """Whether nothing is trusted so far, and a round brought nothing better."""
+    def _is_hopeless(self) -> bool:
+        """Whether nothing so far is near holding, of candidates enough to tell."""
+        if self.done is None:
+            return False
         # Scores of pinches that do not lift tell nothing of those to come.
-        if self.problem.lies_flat and not len(done.rows):
-            return True
-        gained = done.best_mean - before.best_mean >= self.config.rescue.least_gain
-        return not gained and done.lacking(least_score) == self.request.num
+        if self.problem.lies_flat:
+            return not len(self.done.rows)
+        rescue = self.config.rescue
+        return self.done.made >= rescue.patience and not bool((self.done.pool.score > rescue.hopeless).any())
 
 
 def _drawn(first: int, count: int) -> list[int]:
