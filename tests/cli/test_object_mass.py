@@ -8,6 +8,7 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.cli.view import Picture, of_object
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import OBJECT_MASS
 from dro_grasp.grasps.sources import object_of, recorded_mass, with_own_files
@@ -60,6 +61,16 @@ def test_generate_writes_the_mass(generate, tmp_path: Path) -> None:
     path = tmp_path / "grasps.parquet"
     generate("--output", str(path), "--protocol", "none", "--mass", "0.15", num=1)
     assert object_of(GraspBatch.load(path), None, 1.0).mass == pytest.approx(0.15, rel=1e-12)
+
+
+def test_pages_and_pictures_of_a_file_show_its_mass(tmp_path: Path) -> None:
+    path = tmp_path / "heavy.parquet"
+    made_for(0.7).save(path)
+    ((drawn, _),) = Picture(path, tmp_path / "sheet.png").pairs(GraspBatch.load(path))
+    shown, _ = of_object(GraspBatch.load(path), None, 1.0)
+    other, _ = of_object(GraspBatch.load(path), "can", 1.0)
+    assert [drawn.mass, shown.mass, other.mass] == pytest.approx([0.7] * 3, rel=1e-12)
+    assert main(["export", str(path), "--format", "csv", "--output", str(tmp_path / "heavy.csv")]) == 0, "it needs the object"
 
 
 def test_grasps_of_several_masses_need_one_to_be_stated(
