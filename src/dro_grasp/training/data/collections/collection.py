@@ -45,7 +45,7 @@ class Sources:
         """Those of grasps of one pair; the hashes that the grasps state are checked."""
         whose, of = pair_keys(grasps)
         hand = self.hands[whose] = self.hands.get(whose) or hand_of(grasps, None)
-        heavy = of, recorded_mass(grasps)
+        heavy = *of, recorded_mass(grasps)
         obj = self.objects[heavy] = self.objects.get(heavy) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
         return hand, obj
