@@ -163,7 +163,8 @@ def test_json_example_has_the_keys_of_generate() -> None:
     source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
     assert all(f'"{key}":' in source for key in example)
     assert list(example["seconds"]) == [
-        "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "trial", "files", "total"]
+        "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease", "trial",
+        "files", "total"]
 
 
 @pytest.mark.parametrize(("document", "key"), [("export.md", "T_frame_object"), ("own-object.md", "T_frame_camera")])

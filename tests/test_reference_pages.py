@@ -12,7 +12,18 @@ import pytest
 from dro_grasp import errors
 from dro_grasp.arm.tabletop import Attempt
 from dro_grasp.geometry.multilateration import MultilaterationConfig
-from dro_grasp.grasps.columns import CAMERA, COLUMNS, DEPTH, FRAME, FURTHER, HAND_FILE, OBJECT_FILE, OBJECT_SCALE, RELABELLED
+from dro_grasp.grasps.columns import (
+    CAMERA,
+    COLUMNS,
+    DEPTH,
+    FRAME,
+    FURTHER,
+    HAND_FILE,
+    OBJECT_FILE,
+    OBJECT_MASS,
+    OBJECT_SCALE,
+    RELABELLED,
+)
 from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig
 from dro_grasp.hands.library import load_hand
@@ -183,6 +194,6 @@ def stated_names(page: str) -> set[str]:
 def test_the_page_of_formats_has_every_column() -> None:
     stated = stated_names("file-formats.md")
     grasps = {*COLUMNS, "wrist_position", "wrist_quaternion_wxyz", "success", *FURTHER, *NAMES, HAND_FILE, OBJECT_FILE,
-              OBJECT_SCALE, FRAME, CAMERA, DEPTH, RELABELLED}
+              OBJECT_SCALE, OBJECT_MASS, FRAME, CAMERA, DEPTH, RELABELLED}
     assert grasps - {"T_object_wrist", "trial_success"} <= stated
     assert {f.name for f in fields(Attempt)} <= stated

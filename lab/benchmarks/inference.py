@@ -41,7 +41,7 @@ HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""
 OBJECT = "rubber_duck"
 RUNS, FULL = 3, 15
-PARTS = ("network", "choose", "decode", "refine", "settle", "rank")
+PARTS = ("network", "choose", "decode", "refine", "settle", "rank", "weigh")
 OTHERS = {"quiet": 0, "busy": 2}
 """Processes that compute beside the measurement."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal, cast
 
 import mujoco
 import numpy as np
@@ -12,8 +13,9 @@ import torch
 from PIL import Image
 
 import dro_grasp as dro
+from dro_grasp.arm import tabletop
 from dro_grasp.arm.animation import Recorder, draw_animation
-from dro_grasp.arm.physics import Deviation, LiftScene
+from dro_grasp.arm.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planner import PlanConfig
 from dro_grasp.arm.table_scene import sort_out
 from dro_grasp.arm.tabletop import (
@@ -29,6 +31,7 @@ from dro_grasp.arm.tabletop import (
 )
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.perception.scan import depth_points
+from dro_grasp.objects.shape import solid_of
 
 QUICK = TabletopConfig(
     see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=8, best_seconds=30, planner_seconds=30))
@@ -134,7 +137,38 @@ def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None
         TabletopConfig(region=(0.5, 0.0, 0.4, 0.1))
 
 
+@pytest.mark.parametrize("see", ["mesh", "cloud"])
+def test_a_stated_mass_is_lifted_and_planned_for(
+    robot: dro.Robot, can: dro.ObjectModel, see: Literal["mesh", "cloud"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stands beside it keeps its own mass; the attempt ends where the plan would begin."""
+    known, scenes = [], []
+    honest = tabletop.scatter
+
+    def scattered(scene: LiftScene, *rest: Any) -> bool:
+        scenes.append(scene)
+        return honest(scene, *rest)
+
+    def unplanned(robot: dro.Robot, obj: dro.ObjectModel, *rest: Any) -> None:
+        known.append(obj)
+        raise dro.DroGraspError("not planned")
+
+    monkeypatch.setattr(tabletop, "scatter", scattered)
+    monkeypatch.setattr(tabletop, "plan", unplanned)
+    for mass in (0.4, None):
+        config = replace(QUICK, see=see, mass=mass, clutter=1)
+        made = attempt(robot, can, 0, 0, cast(dro.GraspPredictor, None), config)
+        assert made.reason == "not planned"
+        bodies = [scenes[-1].model.body(object_name(i)).mass[0] for i in range(2)]
+        assert bodies == pytest.approx([mass or can.mass, other_objects("can", 1, np.random.default_rng([0, 0, 1]))[0].mass])
+        assert known[-1].stated_mass == mass
+    assert solid_of(known[0]).mass == pytest.approx(0.4, rel=1e-6)
+
+
 def test_settings_go_through_labels_and_back() -> None:
+    heavy = TabletopConfig(mass=0.4)
+    assert TabletopConfig.from_label(heavy.label()) == heavy
+    assert "mass" not in TabletopConfig().label(), "attempts that were stored before masses could be stated stay valid"
     assert TabletopConfig.from_label(TabletopConfig().label()) == TabletopConfig()
     wanted = dro.Constraints((0.0, 0.0, -1.0), max_tilt=0.5, pregrasp_clearance=0.01)
     config = TabletopConfig(plan=dro.PlanConfig(constraints=wanted))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -17,9 +20,12 @@ from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.planner import grasps_in_world, plan
 from dro_grasp.arm.tabletop import TabletopConfig
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import NoGraspError, OptionError
+from dro_grasp.predict.predictor import Prediction
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
+from tests.helpers.weights import untrained_weights
 
 SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
 """Centre and size of a board beside the object, larger than any object that is loaded [m]."""
@@ -131,6 +137,43 @@ def test_what_says_nothing_or_says_it_twice_is_refused(
         plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(contact_region=((0.0, 0.0, 0.0, 0.05),))))
     with pytest.raises(OptionError, match="objects of attempts come to rest anywhere"):
         TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(keep_out=((0.0, 0.0, 0.0, 0.05),))))
+
+
+class Listener(dro.GraspPredictor):
+    """Notes the least confidence of every request, and makes nothing."""
+
+    def __init__(self) -> None:
+        self.device, self.asked = "cpu", list[float | None]()
+
+    def run(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Prediction:
+        self.asked.append(request.least_confidence)
+        raise NoGraspError("nothing is made")
+
+
+@pytest.mark.parametrize(("directions", "each"), [("all", 1), ("paper", 2)])
+@pytest.mark.parametrize("least", [0.0, 0.6, None])
+def test_every_batch_is_asked_for_with_the_least_confidence(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], directions: Literal["all", "paper"], each: int,
+    least: float | None
+) -> None:
+    listener = Listener()
+    config = dro.PlanConfig(num=2, batches=2, directions=directions, least_confidence=least)
+    with pytest.raises(dro.DroGraspError, match="nothing is made"):
+        plan(robot, *standing, predictor=listener, config=config)
+    assert listener.asked == [least] * 2 * each
+
+
+def test_grasps_below_the_least_confidence_are_not_tried(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], tmp_path: Path
+) -> None:
+    """Untrained weights alone make none that surely holds; the same grasps are tried where nothing is demanded."""
+    predictor = dro.GraspPredictor(str(untrained_weights(tmp_path)))
+    config = dro.PlanConfig(num=2, batches=1, rehearsals=0, source="network", best_seconds=30, planner_seconds=30)
+    with pytest.raises(dro.DroGraspError, match=r"only 0 of \d+ candidates .* probability below 99 %"):
+        plan(robot, *standing, predictor=predictor, config=replace(config, least_confidence=0.99))
+    made = plan(robot, *standing, predictor=predictor, config=replace(config, least_confidence=0.0))
+    assert made.notes.grasps == 2
+    assert torch.tensor(made.notes.score).sigmoid() < 0.99
 
 
 def test_where_no_grasp_respects_the_constraints_the_plan_says_so(robot, standing) -> None:

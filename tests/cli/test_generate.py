@@ -92,7 +92,8 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     report = generate("--output", str(path), source="auto", candidates=4)
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {
-        "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "trial", "files", "total"}
+        "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease", "trial",
+        "files", "total"}
     parts = sum(value for name, value in report["seconds"].items() if name != "total")
     assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
     assert (report["num"], report["protocol"]) == (3, "carry")

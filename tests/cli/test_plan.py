@@ -53,13 +53,15 @@ def test_every_option_reaches_the_planner_and_every_file_is_written(
 ) -> None:
     palm = ["--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012"]
     places = ["--hold", "0.5", "0.1", "0.2", "0.03", "--spare", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
-    numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", weights]
+    numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", weights,
+               "--least-confidence", "0.35"]
     files = ["--output", "plan.npz", "--trajectory", "plan.yaml", "--csv", "plan.csv"]
     where = ["--at", "0.5", "0.1", "--obstacles", "cube"]
     assert planned(*where, *palm, *places, *numbers, *files, "--json") == 0
     hold, spare = ((0.5, 0.1, 0.2, 0.03),), ((0, 0, 1, 0.1), (0, 0, 2, 0.2))
     constraints = dro.Constraints((0, 0, -1), None, 0.6, None, hold, spare, 0.012)
-    assert asked["config"] == dro.PlanConfig(9, 2, constraints=constraints, rehearsals=4, planner_seconds=2.5)
+    assert asked["config"] == dro.PlanConfig(
+        9, 2, constraints=constraints, rehearsals=4, planner_seconds=2.5, least_confidence=0.35)
     assert (asked["seed"], asked["predictor"].weights_name) == (7, dro.load_weights(weights).name)
     assert (asked["obj"].name, [o.name for o in asked["obstacles"]]) == ("can", ["cube"])
     stands = np.asarray(asked["obj"].vertices) @ asked["T"][:3, :3].T + asked["T"][:3, 3]
@@ -112,6 +114,9 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     (["--near", "nan", "0"], "--near is nan 0; give x and y in metres"),
     (["--planner-seconds", "nan"], "planner_seconds is nan; give a number above 0"),
     (["--planner-seconds", "inf"], "planner_seconds is inf; give a number above 0"),
+    (["--least-confidence", "1"], "least_confidence is 1.0; give a probability from 0"),
+    (["--least-confidence", "nan"], "least_confidence is nan"),
+    (["--mass", "-1"], "mass is -1.0; give kilograms, above 0"),
     (["--efforts"], "--efforts are written into the trajectory file; name one with --trajectory YAML"),
     (["--camera", "robot"], "has no camera; state it in the robot file, or give --camera JSON"),
 ])

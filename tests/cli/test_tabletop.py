@@ -51,9 +51,10 @@ def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
     assert lifted("--see", "mesh", "--order", "random", "--direction", "0", "0", "-1", "--max-tilt", "0.6",
                   "--pregrasp-clearance", "0.012",
                   "--num", "9", "--rehearsals", "4", "--clutter", "2", "--segment", "mask", "--noise", "0.003", "--seed", "5",
+                  "--mass", "0.25",
                   "--json") == 0
     constraints = dro.Constraints((0, 0, -1), max_tilt=0.6, pregrasp_clearance=0.012)
-    config = TabletopConfig("mesh", 0.003, clutter=2, segment="mask", plan=dro.PlanConfig(
+    config = TabletopConfig("mesh", 0.003, clutter=2, segment="mask", mass=0.25, plan=dro.PlanConfig(
         9, order="random", rehearsals=4, constraints=constraints))
     assert [TabletopConfig.from_label(a.settings) for a in done] == [config] * 4
     assert {(a.robot, a.seed) for a in done} == {(dro.load_robot(small_robot).name, 5)}
@@ -86,6 +87,8 @@ def test_people_see_objects_rates_and_every_attempt_aside(
     (["--noise", "-0.001"], "noise is -0.001; give a standard deviation in metres from 0 on"),
     (["--noise", "nan"], "noise is nan"),
     (["--clutter", "-1"], "clutter is -1"),
+    (["--mass", "0"], "mass is 0.0; give kilograms, above 0"),
+    (["--mass", "250"], "250 g are 0.25 kg"),
     (["--plans", "mine"], "mine is a file; give a folder"),
     (["--output", "nowhere/results.parquet"], "create it first"),
     (["--direction", "0", "0", "-1", "--directions", "paper"], "leave out one of them"),

@@ -14,7 +14,7 @@ import torch
 
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_MASS, OBJECT_SCALE
 from dro_grasp.grasps.grasp_file import METADATA_KEY, read_footer
 from dro_grasp.training.data.collections.collection import count_collection
 from tests.helpers.tiny_bundle import made_up_grasps
@@ -56,6 +56,7 @@ def test_a_header_of_other_types_is_refused(tmp_path: Path, header: dict[str, An
     ({"reason": pa.array([1, 2])}, "column 'reason' holds int64"), ({"hand_file": pa.array([1.0, 2.0])}, "column 'hand_file'"),
     ({"score": pa.array(["a", "b"])}, "column 'score' holds string, expected numbers"),
     ({"seed": pa.array(["a", "b"])}, "column 'seed' holds string"),
+    ({"object_mass": pa.array(["a", "b"])}, "column 'object_mass' holds string, expected numbers"),
     ({"success": pa.array([1, 0])}, "column 'success' holds int64"),
     ({"contact_links": pa.array([[1], [2]])}, "column 'contact_links'"), ({CAMERA: None}, f"lacks the column '{CAMERA}'"),
     ({CAMERA: pa.array([[1.0], [2.0]])}, "no pose of 16 finite numbers"),
@@ -74,5 +75,6 @@ def test_yields_that_are_no_counts_are_refused(tmp_path: Path, yields: Any) -> N
         count_collection(written(tmp_path / "g.parquet", {"notes": {"yields": yields}}))
 
 
-def test_a_scale_that_is_not_stated_is_none(tmp_path: Path) -> None:
-    assert OBJECT_SCALE not in GraspBatch.load(written(tmp_path / "g.parquet", columns={OBJECT_SCALE: pa.nulls(2)})).extra
+@pytest.mark.parametrize("column", [OBJECT_SCALE, OBJECT_MASS])
+def test_a_scale_or_mass_that_is_not_stated_is_none(tmp_path: Path, column: str) -> None:
+    assert column not in GraspBatch.load(written(tmp_path / "g.parquet", columns={column: pa.nulls(2)})).extra

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ import dro_grasp as dro
 from dro_grasp.errors import DroGraspError
 from dro_grasp.objects.shape import DENSITY, solid_of, with_mass
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
+from dro_grasp.predict import finish
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig, settle_best, settle_grasps, weigh_settled, weight_config
@@ -22,6 +26,7 @@ from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import object_mass
 from dro_grasp.simulation.weighing import WeighingConfig
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.weights import untrained_weights
 
 HAND, CAN = loaded_hand("gripper3"), dro.load_object("can")
 HELD = SettleConfig(weight=WeightConfig(pull=0.0))
@@ -110,3 +115,31 @@ def test_what_held_the_mass_as_it_settled_carries_it_at_least(grasps: dro.GraspB
         payload = weigh_settled(problem, settled, WeighingConfig(), SettleConfig())
         assert torch.equal(payload >= obj.mass, held)
         assert not torch.equal(payload, settled.payload)
+
+
+def test_the_time_for_weighing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With weighing that takes a quarter of a second more, and easing that takes half of that more."""
+    weigh, ease, slept = finish.weigh_settled, finish.ease, []
+
+    def slow_weigh(*given: Any) -> Any:
+        slept.append("weigh")
+        time.sleep(0.25)
+        return weigh(*given)
+
+    def slow_ease(*given: Any) -> Any:
+        slept.append("ease")
+        time.sleep(0.125)
+        return ease(*given)
+
+    predictor, problem = dro.GraspPredictor(str(untrained_weights(tmp_path))), GraspProblem(HAND, CAN)
+    request = dro.GraspRequest(num=4, candidates=1, source="network")
+    predictor.run(problem, request)
+    monkeypatch.setattr(finish, "weigh_settled", slow_weigh)
+    monkeypatch.setattr(finish, "ease", slow_ease)
+    begin = time.perf_counter()
+    made = predictor.run(problem, request)
+    whole = time.perf_counter() - begin
+    assert slept == ["weigh", "ease"]
+    assert made.seconds["weigh"] > 0.25
+    assert 0.125 < made.seconds["ease"] < 0.25
+    assert 0.8 * whole < sum(made.seconds.values()) <= whole

@@ -37,6 +37,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, violations
 from dro_grasp.predict.config import AUTO, GraspRequest
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
@@ -99,6 +100,7 @@ class PlanConfig(Checked):
             raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
         if self.constraints.direction is not None and self.directions != "all":
             raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
+        check_confidence(self.least_confidence or 0.0)
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")

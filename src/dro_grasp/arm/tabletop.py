@@ -42,7 +42,7 @@ from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import depth_points
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.scene import PREFIX
@@ -75,11 +75,14 @@ class TabletopConfig(Checked):
     """How long it is then shaken [s]."""
     plan: PlanConfig = field(default_factory=PlanConfig)
     """How motions are planned."""
+    mass: float | None = None
+    """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be set up.
 
         Raises:
+            ObjectError: The mass is not above 0, or larger than any hand holds.
             OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
                 on places.
         """
@@ -93,12 +96,16 @@ class TabletopConfig(Checked):
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
+        if self.mass is not None:
+            check_mass(self.mass)
         if not 0 <= self.clutter <= 8:  # there is no room for more
             raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to 8")
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
-        return LABEL + json.dumps(asdict(self), sort_keys=True)
+        # A mass that is not stated is left out: attempts of before it could be are not repeated.
+        given = {name: value for name, value in asdict(self).items() if (name, value) != ("mass", None)}
+        return LABEL + json.dumps(given, sort_keys=True)
 
     @staticmethod
     def from_label(label: str) -> TabletopConfig:
@@ -202,6 +209,7 @@ def attempt(
     """
     config = config or TabletopConfig()
     _check(robot, obj, config)
+    obj = obj if config.mass is None else with_mass(obj, config.mass)
     others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
     scene = LiftScene(Workcell(robot), [obj, *others])
     result = Attempt(robot.name, obj.name, number, seed, config.label())
@@ -355,7 +363,8 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
     points = depth_points(depth, thinned_intrinsics(camera))
     known = mask[depth > 0] if config.segment == "mask" else None
-    return pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known), np.eye(4)
+    seen = pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
+    return seen if config.mass is None else replace(seen, obj=with_mass(seen.obj, config.mass)), np.eye(4)
 
 
 def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:

@@ -39,7 +39,8 @@ class Evaluate:
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use instead of the one named in the file, for a file with one object."""
     scale: float = 1.0  # Scale of the mesh given with --object.
-    mass: Mass = None  # Mass of every object [kg].
+    mass: Mass = None
+    """Mass of every object [kg], instead of the one that the file records."""
     contact_quality: Flag = False
     """Also measure the analytic metrics of DexGraspBench, with the protocol's friction: penetration, contact distance and
     force closure of the grasps as they are, without any motion."""
@@ -83,24 +84,22 @@ class Evaluate:
     ) -> tuple[list[tuple[str, GraspProblem, GraspBatch]], dict[str, GraspBatch]]:
         """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds."""
         from dro_grasp.errors import ObjectError
-        from dro_grasp.grasps.sources import object_of
-        from dro_grasp.objects.shape import with_mass
+        from dro_grasp.grasps.sources import object_of, with_mass_of
         from dro_grasp.predict.problem import GraspProblem
         from dro_grasp.simulation.scene import require_simulable
 
         problems, bare = [], {}
         refusal: ObjectError | None = None
         for name, part in grasps.by_object():
-            obj = object_of(part, self.object, self.scale)
+            obj = object_of(part, self.object, self.scale, self.mass)
             compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)
-            obj = obj if self.mass is None else with_mass(obj, self.mass)
             try:
                 require_simulable(hand, obj)
             except ObjectError as error:
                 refusal = error
                 bare[name] = part
             else:
-                problems.append((name, GraspProblem(hand, obj), part))
+                problems.append((name, GraspProblem(hand, obj), with_mass_of(part, obj)))
         if refusal is not None and not problems:
             raise refusal
         for name, part in bare.items():

@@ -217,6 +217,7 @@ class Tabletop:
     order: Literal["score", "random"] = "score"  # Reachable grasps to take: the best by score, or, as a control, any.
     directions: Literal["paper", "all"] = "all"  # Palm directions: paper, from above to the right side, or all.
     constraints: PalmOptions = field(default_factory=PalmOptions)  # In the world frame.
+    mass: Mass = None  # Mass of each object to lift [kg], which its grasps shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
@@ -255,7 +256,7 @@ class Tabletop:
             check_output(self.video, *FORMATS)
         config = TabletopConfig(
             self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
-            plan=PlanConfig(
+            mass=self.mass, plan=PlanConfig(
                 self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))
         run = TabletopRun(

@@ -21,7 +21,7 @@ from dro_grasp.files import given_path, reading
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps import columns
-from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
 
 HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a name"}  # Texts of the header
 JOINTS = "joint_names"  # Entry of the header with the names of the joints
@@ -49,7 +49,7 @@ def _is_list_of(test: Callable[[pa.DataType], bool]) -> Callable[[pa.DataType], 
 
 KINDS: tuple[tuple[str, Callable[[pa.DataType], bool], tuple[str, ...]], ...] = (
     ("texts", _is_text, (*columns.TEXTS, "protocol", columns.REASON, columns.FAILURE, HAND_FILE, OBJECT_FILE, FRAME)),
-    ("numbers", _is_number, (*columns.FLOATS, OBJECT_SCALE)),
+    ("numbers", _is_number, (*columns.FLOATS, OBJECT_SCALE, OBJECT_MASS)),
     ("whole numbers", pa.types.is_integer, ("seed",)),
     ("truth values", pa.types.is_boolean, ("success",)),
     ("lists of numbers", _is_list_of(_is_number),
@@ -268,8 +268,9 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
     known = {*columns.COLUMNS, *REQUIRED, "success"}
     extra = {name: _decode_further(table[name]) for name in table.column_names if name not in known}
-    if not isinstance(extra.get(OBJECT_SCALE), Tensor):  # null for every grasp
-        extra.pop(OBJECT_SCALE, None)
+    for name in (OBJECT_SCALE, OBJECT_MASS):
+        if not isinstance(extra.get(name), Tensor):  # null for every grasp
+            extra.pop(name, None)
     _check_frames(extra, path)
     seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
     return {

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
-from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
 
 if TYPE_CHECKING:
     from dro_grasp.frames import NamedMotion
@@ -44,12 +44,23 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
 
 
 def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBatch:
-    """Grasps of one object that record the files which a user's own hand and object were loaded from."""
+    """Grasps of one object that record its stated mass, and the files which a user's own hand and object were loaded from."""
     from dro_grasp.hands.library import BUILTIN_FOLDER
 
     read = hand.description
     own = read is not None and hand.name == read.name and read.path.parent != BUILTIN_FOLDER
+    grasps = with_mass_of(grasps, obj)
     return with_sources(grasps, read.source if read is not None and own else hand.name, obj.file or obj.name, obj.scale)
+
+
+def with_mass_of(grasps: GraspBatch, obj: ObjectModel) -> GraspBatch:
+    """Grasps of one object that record the mass which was stated of it, and no other."""
+    import torch
+
+    extra = {name: column for name, column in grasps.extra.items() if name != OBJECT_MASS}
+    if obj.stated_mass is not None:
+        extra[OBJECT_MASS] = torch.full((len(grasps),), obj.stated_mass)
+    return grasps.replace(extra=extra)
 
 
 def require_pair(hand: Any, obj: Any) -> None:
@@ -80,11 +91,23 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
                         "--hand") from error
 
 
-def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
-    """The object of grasps of one object, or the given one; a table in its cloud is kept if the grasps kept it.
+def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float | None = None) -> ObjectModel:
+    """The object of grasps of one object, or the given one, with this mass [kg]; None takes the one that the grasps record.
 
-    `scale` is that of an object whose grasps record none. ObjectError: it is not found; the message asks for --object.
+    `scale` is that of an object whose grasps record none.
+
+    Raises:
+        ObjectError: It is not found, and the message asks for --object; or the grasps record several masses.
     """
+    from dro_grasp.objects.shape import with_mass
+
+    mass = recorded_mass(grasps) if mass is None else mass
+    obj = _object_of(grasps, given, scale)
+    return obj if mass is None else with_mass(obj, mass)
+
+
+def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
+    """The object, whatever was stated of its mass; a table in its cloud is kept if the grasps kept it."""
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.objects.perception.scan import load_scan
 
@@ -120,9 +143,26 @@ def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
     source = _recorded(grasps, OBJECT_FILE)
     if source and OBJECT_SCALE in grasps.extra:
-        # Files hold single precision: the shortest decimal number is the one that was given, and gives the same object.
-        scale = float(str(grasps.extra[OBJECT_SCALE][0].float().numpy()))
+        scale = _as_given(grasps.extra[OBJECT_SCALE][0])
     return source or grasps.object[0], scale
+
+
+def recorded_mass(grasps: GraspBatch) -> float | None:
+    """The mass that was stated of the object of some grasps [kg]; None for none. ObjectError: they record several."""
+    if (column := grasps.extra.get(OBJECT_MASS)) is None:
+        return None
+    masses = column.unique(dim=0)
+    known = [_as_given(mass) for mass in masses[masses.isfinite()]]
+    if len(known) > 1 or (known and bool(column.isnan().any())):
+        listed = " and ".join([f"{mass:g} kg" for mass in known] + ["none"] * bool(column.isnan().any()))
+        raise ObjectError(f"the grasps of '{grasps.object[0]}' were made for several masses, {listed}; state one with --mass, "
+                          "or give files that are of one mass each")
+    return known[0] if known else None
+
+
+def _as_given(value: Float[Tensor, ""]) -> float:
+    """A number of a file, which holds single precision: the shortest decimal is the one that was given."""
+    return float(str(value.float().numpy()))
 
 
 def pair_keys(grasps: GraspBatch) -> tuple[tuple[str, str], tuple[str, str | tuple[str, float]]]:

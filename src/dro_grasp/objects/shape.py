@@ -69,6 +69,8 @@ class ObjectModel:
     """Factor that the file's coordinates were multiplied by."""
     density: float = DENSITY
     """Mass over volume [kg/m^3]."""
+    stated_mass: float | None = None
+    """The mass, if `with_mass` stated it [kg]."""
 
     def __repr__(self) -> str:
         size = " x ".join(f"{100 * side:.1f}" for side in self.extents)
@@ -149,17 +151,21 @@ class ObjectModel:
         return cloud[random_half(cloud, count, generator)]
 
 
+def check_mass(mass: float) -> None:
+    """Refuse a mass [kg] that is not above 0, or larger than any hand holds: ObjectError."""
+    if not 0 < mass <= LARGEST_MASS:
+        grams = f"; {mass:g} g are {mass / 1e3:g} kg" if LARGEST_MASS < mass < 1e5 else ""
+        raise ObjectError(f"mass is {mass}; give kilograms, above 0 and at most {LARGEST_MASS:g}, for example 0.4{grams}")
+
+
 def with_mass(obj: ObjectModel, mass: float) -> ObjectModel:
     """The same object with this mass [kg], spread evenly over its volume; of a bare cloud, over what it encloses.
 
     Raises:
         ObjectError: The mass is not above 0, or larger than any hand holds.
     """
-    if not 0 < mass <= LARGEST_MASS:
-        grams = f"; {mass:g} g are {mass / 1e3:g} kg" if LARGEST_MASS < mass < 1e5 else ""
-        raise ObjectError(
-            f"mass is {mass}; give kilograms, above 0 and at most {LARGEST_MASS:g}, for example --mass 0.4{grams}")
-    heavy = replace(obj, density=mass / (obj.volume or solid_of(obj).volume))
+    check_mass(mass)
+    heavy = replace(obj, density=mass / (obj.volume or solid_of(obj).volume), stated_mass=mass)
     if (field := vars(obj).get("distance_field")) is not None:  # a bare cloud's takes a second to compute again
         vars(heavy)["distance_field"] = field
     return heavy

@@ -92,6 +92,8 @@ class Finished:
     """Time by stage [s]."""
     doubts: tuple[str, ...] = ()
     """What closing showed against each of the pool, in words; empty for nothing."""
+    watch: Stopwatch = field(default_factory=lambda: Stopwatch("weigh", "ease"))
+    """Time of what is done to the best alone, once `grasps` was asked for [s]."""
 
     @cached_property
     def rows(self) -> Int[Tensor, " k"]:
@@ -114,8 +116,12 @@ class Finished:
         """The best, complete, weighed and eased, as they are returned."""
         best, settling = self.problem.on_table(self.pool[self.rows]), self.config.settle
         if self.config.weigh is not None and settling is not None and bool(best.payload.isfinite().any()):
-            best = best.replace(payload=weigh_settled(self.problem, best, self.config.weigh, settling))
-        return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
+            with self.watch("weigh"):
+                best = best.replace(payload=weigh_settled(self.problem, best, self.config.weigh, settling))
+        if self.config.ease is None:
+            return best
+        with self.watch("ease"):
+            return ease(self.problem, best, self.config.ease, self.config.admission)
 
     @property
     def proposed(self) -> Candidates:

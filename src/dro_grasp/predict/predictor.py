@@ -37,7 +37,7 @@ from dro_grasp.predict.sources.source import Progress, Source, ask
 from dro_grasp.predict.sources.variation import VariationSource
 from dro_grasp.predict.stages import complete
 
-PARTS = ("network", "choose", "decode", "optimiser", "refine", "settle", "rank")
+PARTS = ("network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease")
 """Parts of a prediction whose seconds are always told."""
 
 
@@ -189,8 +189,8 @@ class GraspPredictor:
         proposed = done.proposed
         given, before = (grasps.with_asked(request.num) for grasps in (
             with_own_files(done.grasps, problem.hand, problem.obj), complete(problem, proposed.grasps)))
-        return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped), asked.seconds,
-                          shortage)
+        return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped),
+                          asked.seconds | done.watch.seconds, shortage)
 
     def source(self, name: str | Source, temperature: float | None = None) -> Source:
         """A source by its name, with the predictor's weights and configuration where it has any.

@@ -15,6 +15,7 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
 from dro_grasp.hands.effort import find_efforts
+from dro_grasp.predict import stages
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.problem import GraspProblem
 from tests.helpers.claw_urdf import claw, written
@@ -77,6 +78,30 @@ def test_answers_carry_forces(answerer: Answerer) -> None:
     assert (second["squeeze_torque"], second["payload"], second["squeeze_force"]) == (None, None, 6.25)
 
 
+def test_the_objects_mass_is_the_one_that_is_sent(answerer: Answerer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a mesh and of a cloud, in prediction and in trial, and not in what is asked for next."""
+    seen: list[float] = []
+    predict, trial = answerer.predictor.run, stages.simulate
+
+    def run(problem: GraspProblem, *rest: Any) -> Any:
+        seen.append(problem.mass)
+        return predict(problem, *rest)
+
+    def simulate(hand: dro.Hand, obj: dro.ObjectModel, *rest: Any, **options: Any) -> Any:
+        seen.append(obj.mass)
+        return trial(hand, obj, *rest, **options)
+
+    monkeypatch.setattr(answerer.predictor, "run", run)
+    monkeypatch.setattr(stages, "simulate", simulate)
+    usual, cloud = dro.load_object("can").mass, {"points": SPHERE}
+    for mass in (0.7, 0.2, None):
+        ask(answerer, "can", num=1, mass=mass, protocol="dro")
+    ask(answerer, cloud, num=1, mass=0.3)
+    assert seen == pytest.approx([0.7, 0.7, 0.2, 0.2, usual, usual, 0.3])
+    with pytest.raises(ValueError, match=r"mass\n.* valid number"):
+        GraspCall(hand="gripper3", object="can", mass="heavy")
+
+
 def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> None:
     wall, T = np.array([[0.06, y, z] for y in np.linspace(-0.2, 0.2, 40) for z in np.linspace(-0.2, 0.2, 40)]), np.eye(4)
     T[0, 3] = 0.01
@@ -134,7 +159,9 @@ CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
     ({"object": sent_file("../../gone.stl", b"hello")}, "^gone.stl "),
     ({"object": sent_file("a.gltf", GLTF)}, "^a.gltf .*passwd"),
     ({"num": 0}, "num is 0"), ({"direction": [0, 0, 0]}, "no direction"), ({"seed": -1}, "seed is -1"),
-    ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
+    ({"mass": 0.0}, "mass is 0.0; give kilograms, above 0"), ({"mass": 400.0}, "400 g are 0.4 kg"),
+    ({"mass": float("nan")}, "mass is nan"), ({"num": 1001}, "at most 1000"),
+    ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
     ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
     ({"obstacles": "/etc/passwd"}, "obstacles names '/etc/passwd'"), ({"obstacles": {"points": []}}, "holds no point"),
     ({"camera": CAMERA}, "send the cloud"),

@@ -62,10 +62,10 @@ def client(server: HTTPServer) -> dro.GraspClient:
 def test_numbers_may_be_arrays_and_tensors(client: dro.GraspClient, sent: list[Any], array: Any) -> None:
     client.predict(
         "gripper3", array(CLOUD), 2, direction=array([0, 0, -1]), contact_region=array([[0, 0, 0.5, 0.25]]),
-        table=array(-0.5), keep_table=np.bool_(True), camera={"frame": "base", "T_frame_camera": array(POSE)},
+        table=array(-0.5), mass=array(0.25), keep_table=np.bool_(True), camera={"frame": "base", "T_frame_camera": array(POSE)},
         obstacles=array(CLOUD) + 1, keep_out=[array([0, 1, 0, 0.25])])
     (call,) = sent
-    assert (call.direction, call.contact_region, call.table) == ((0, 0, -1), ((0, 0, 0.5, 0.25),), -0.5)
+    assert (call.direction, call.contact_region, call.table, call.mass) == ((0, 0, -1), ((0, 0, 0.5, 0.25),), -0.5, 0.25)
     assert (call.keep_out, call.object.keep_table) == (((0, 1, 0, 0.25),), True)
     assert call.camera.T_frame_camera == POSE
     for part, points in ((call.object, CLOUD), (call.obstacles, CLOUD + 1)):

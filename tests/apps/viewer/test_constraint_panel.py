@@ -53,6 +53,20 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio) -> None:
     assert asked(studio)[0].constraints.obstacles is None
 
 
+def test_a_stated_mass_is_the_objects(studio: Studio) -> None:
+    usual = load_object("sphere").mass
+    for text, mass in (("", usual), ("0.4", 0.4), ("", usual)):
+        studio.mass.value = text
+        assert asked(studio)[0].mass == pytest.approx(mass), text
+    for text, message in (("heavy", "is 'heavy', which holds something else than numbers"), ("0.1 0.2", "give one number"),
+                          ("-1", "mass is -1.0; give kilograms"), ("300", "300 g are 0.3 kg")):
+        studio.mass.value = text
+        studio._guarded(studio._generate)
+        assert studio.status.content.startswith("**Error:**")
+        assert message in studio.status.content
+    studio.mass.value = ""
+
+
 @pytest.mark.parametrize(("field", "text", "message"), [
     ("table", "high", "something else than numbers"), ("table", "0 1", "give one number"),
     ("contact_region", "0 0 0", "give x y z radius"), ("max_tilt", "200", "max_tilt is 3.49"),

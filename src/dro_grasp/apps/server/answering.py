@@ -33,7 +33,7 @@ from dro_grasp.objects.loading import check_scale
 from dro_grasp.objects.perception.scan import scanned_object
 from dro_grasp.objects.reading import read_points
 from dro_grasp.objects.scenery import Scene, load_scene
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -93,7 +93,8 @@ class Answerer:
         hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
         if call.protocol is not None and obj.is_cloud:
             raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
-        pair = hand.name, key, constraints
+        obj = obj if call.mass is None else with_mass(obj, call.mass)
+        pair = hand.name, key, call.mass, constraints
         if (problem := self.problems.get(pair)) is None:
             problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
         loaded = time.perf_counter() - begin

@@ -47,7 +47,7 @@ class GraspClient:
             obj: The path of a mesh or cloud, which is sent; the name of an object that the server knows; or points,
                 (n, 3), as an array, tensor or nested lists [m].
             num: Grasps to return.
-            options: What else a request holds, such as direction, table, camera, protocol; scale and keep_table are the
+            options: What else a request holds, such as direction, table, mass, camera, protocol; scale and keep_table are the
                 object's, and obstacles is a path or points, as the object is. Numbers may be arrays or tensors.
 
         Raises:

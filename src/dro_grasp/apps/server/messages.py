@@ -87,6 +87,8 @@ class _Call(Message):
     """Name of a hand that the server knows."""
     object: SentObject
     """What to grasp."""
+    mass: float | None = None
+    """Mass of the object [kg], which the grasps shall carry; null for density times volume."""
     camera: SentCamera | None = None
     """Where the cloud was seen from; without one, it is taken to be in the frame of the grasps."""
     protocol: str | None = None

@@ -56,7 +56,7 @@ class ConstraintPanel:
         Raises:
             OptionError: A field holds something else than numbers, or they are out of range.
         """
-        tilt, table, clearance = (_number(field) for field in (self.max_tilt, self.table, self.pregrasp_clearance))
+        tilt, table, clearance = (given_number(field) for field in (self.max_tilt, self.table, self.pregrasp_clearance))
         return Constraints(
             direction=None if self.direction.value == ANY else half_axis_direction(self.direction.value), table=table,
             max_tilt=None if tilt is None else math.radians(tilt),
@@ -82,8 +82,8 @@ class ConstraintPanel:
             scene.add_point_cloud("/constraints/obstacles", around.points.astype(np.float32), rgb(AVOIDED), point_size=0.004)
 
 
-def _number(field: viser.GuiTextHandle) -> float | None:
-    """The number of a field; None for an empty one."""
+def given_number(field: viser.GuiTextHandle) -> float | None:
+    """The number of a field; None for an empty one. OptionError: it holds something else."""
     numbers = _numbers(field, field.value)
     if len(numbers) > 1:
         raise OptionError(f"{field.label} is '{field.value}'; give one number, or nothing")

@@ -14,7 +14,7 @@ from functools import partial
 import viser
 
 from dro_grasp.apps.library import Kind, Library
-from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES, ConstraintPanel
+from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES, ConstraintPanel, given_number
 from dro_grasp.apps.viewer.grasp_page import GraspPage, ShownGrasps
 from dro_grasp.apps.viewer.scene_view import HOST, Client, Closed, ServedPage, escaped
 from dro_grasp.errors import DroGraspError
@@ -23,7 +23,7 @@ from dro_grasp.grasps.sources import made_for_another, object_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.pictures.appearance import waiting_pose
 from dro_grasp.pictures.sheets import protocol_name
 from dro_grasp.predict.config import AUTO, GraspRequest
@@ -144,6 +144,7 @@ class Studio(GraspPage):
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
             self.object = gui.add_dropdown("Object", tuple(dict.fromkeys([*object_names(), obj])), initial_value=obj)
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=OBJECT_FILES)
+            self.mass = gui.add_text("Mass [kg]", "", hint="Empty: as the file says, or density times volume.")
         with gui.add_folder("Generate"):
             self.num = gui.add_slider("Grasps", 1, MAX_GRASPS, 1, GraspRequest.num)
             self.source = gui.add_dropdown(
@@ -227,7 +228,8 @@ class Studio(GraspPage):
             return lambda done, total: self._say(f"{what}: {done} of {total}")
 
         wanted, protocol = self.panel.constraints(self.library.scene), self.protocol.value
-        hand, obj = self.library.hand(self.hand.value), self.library.obj(self.object.value)
+        hand, obj, mass = self.library.hand(self.hand.value), self.library.obj(self.object.value), given_number(self.mass)
+        obj = obj if mass is None else with_mass(obj, mass)
         problem = GraspProblem(hand, obj, self.predictor.device, wanted)
         request = GraspRequest(
             int(self.num.value), candidates=int(self.candidates.value), source=self.source.value,

@@ -83,7 +83,7 @@ def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectClou
         hand, obj = loaded.of(grasps)
         stated.append(grasps.replace(hand_sha256=hand.sha256, object_sha256=(obj.sha256,) * len(grasps)))
     found = {hand.sha256: hand for hand in reversed(loaded.hands.values())}
-    named = {(name, obj.sha256): obj for (name, _), obj in loaded.objects.items()}
+    named = {(name, obj.sha256): obj for (name, *_), obj in loaded.objects.items()}
     for kind, names in (("hand", [hand.name for hand in found.values()]), ("object", [name for name, _ in named])):
         double = sorted({name for name in names if names.count(name) > 1})
         if double:

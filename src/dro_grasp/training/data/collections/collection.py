@@ -13,7 +13,7 @@ from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.grasp_file import read_footer
-from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
+from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, recorded_mass, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
@@ -45,7 +45,8 @@ class Sources:
         """Those of grasps of one pair; the hashes that the grasps state are checked."""
         whose, of = pair_keys(grasps)
         hand = self.hands[whose] = self.hands.get(whose) or hand_of(grasps, None)
-        obj = self.objects[of] = self.objects.get(of) or object_of(grasps, None, 1.0)
+        heavy = *of, recorded_mass(grasps)
+        obj = self.objects[heavy] = self.objects.get(heavy) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
         return hand, obj
 

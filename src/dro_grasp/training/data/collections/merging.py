@@ -17,7 +17,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.grasps.batch import GraspBatch, distinct
-from dro_grasp.grasps.columns import CAMERA, CARRYING, FAILURE, OBJECT_SCALE, POSTURES, REASON
+from dro_grasp.grasps.columns import CAMERA, CARRYING, FAILURE, OBJECT_MASS, OBJECT_SCALE, POSTURES, REASON
 from dro_grasp.grasps.grasp_file import encode, table_bytes
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
@@ -31,7 +31,7 @@ MANTISSA = 10
 """Bits of the mantissa of scores, energies, distances and angles of trials, and further columns. Ours: three digits."""
 FILE_BYTES = 100_000_000  # Size of a merged file from which on the next object goes into another [bytes] (ours)
 PLAIN_COLUMNS = (REASON, FAILURE)  # Columns that are empty for successes
-EXACT = (OBJECT_SCALE, CAMERA)  # Further columns without which the object is not found again
+EXACT = (OBJECT_SCALE, OBJECT_MASS, CAMERA)  # Further columns without which the object is not found again
 
 
 @dataclass(frozen=True)
