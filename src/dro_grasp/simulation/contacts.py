@@ -23,6 +23,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
 
@@ -31,17 +32,18 @@ from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
 class Penetration(Rows):
     """Penetration in n grasps."""
 
-    object: Float[np.ndarray, " n"]  # deepest contact of hand and object [m]; zero without contact
+    object: Float[np.ndarray, " n"]  # of hand and object, or how far a finger pierces it [m]; zero without contact
     own: Float[np.ndarray, " n"]  # summed over pairs of hand links, the deepest contact of each pair [m]
 
 
 def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
     """Penetration of the collision shapes in the labelled pose, without any step of time."""
-    depth, own = np.zeros(len(grasps)), np.zeros(len(grasps))
-    for i, contacts in enumerate(find_contacts(scene.model, scene.qpos(grasps.T_object_wrist, grasps.joints))):
+    qpos = scene.qpos(grasps.T_object_wrist, grasps.joints)
+    depth, own = pierced(scene, qpos), np.zeros(len(grasps))
+    for i, contacts in enumerate(find_contacts(scene.model, qpos)):
         inside, bodies = np.maximum(-contacts.distance, 0.0), contacts.bodies
         with_object = (bodies == scene.object_body).any(1)
-        depth[i] = inside[with_object].max(initial=0.0)
+        depth[i] = inside[with_object].max(initial=depth[i])
         deepest: dict[tuple[int, int], float] = {}
         for (a, b), d in zip(np.sort(bodies[~with_object], axis=1), inside[~with_object], strict=True):
             deepest[a, b] = max(deepest.get((a, b), 0.0), float(d))

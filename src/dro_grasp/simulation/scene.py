@@ -134,6 +134,7 @@ SOLVER_ITERATIONS = 20
 """Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
 FAR_AWAY = (0.0, 0.0, 5.0)  # Place of the object until a grasp is written [m]. Ours
 TABLE_AWAY = (0.0, 0.0, -10.0)  # Place of a table while there is none [m]. Ours
+OBJECT_GROUP = 1  # Group of the object's geoms, and of nothing else, by which rays find them
 CACHED_SCENES = 8  # Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols
 
 
@@ -236,7 +237,9 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _exclude_resting_contacts(scene, hand)
-        return TrialScene(scene.compile(), hand, obj, protocol, table)
+        model = scene.compile()
+    model.geom_group[:] = np.where(model.geom_bodyid == model.body("object").id, OBJECT_GROUP, 0)
+    return TrialScene(model, hand, obj, protocol, table)
 
 
 def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:

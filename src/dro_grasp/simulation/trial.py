@@ -21,6 +21,7 @@ from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure, Measurements, TrialResult, verdict
+from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, draw, rollouts
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
@@ -87,6 +88,7 @@ def run_trial(rollout: Rollout, penetration: Penetration) -> TrialResult:
     scene, rules = rollout.scene, rollout.scene.protocol
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)
+    penetration = replace(penetration, object=np.maximum(penetration.object, pierced(scene, rollout.qpos)))
     shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
     # A trial that has failed already needs no forces.
     failed = ((shift > min(rules.max_closing_shift, LOST_DISTANCE)) | (turn > rules.max_closing_rotation)

@@ -1,0 +1,140 @@
+"""Fingers that stick through what is thin.
+
+A wall that runs through a joint touches the links on both sides of it by a millimetre or two, which contacts do not tell from a
+firm grasp. The axis of the finger does: it crosses the wall. Ours.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.simulation.scene import CACHED_SCENES, OBJECT_GROUP, TrialScene
+
+GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
+DEEP = 0.0025  # How far inside the shapes an axis runs elsewhere, along any coordinate [m] (ours)
+SPACING = 0.001  # Distance of the points at which an axis is looked at [m] (ours)
+
+
+@dataclass(frozen=True)
+class Bone:
+    """A straight piece of a finger's axis, between a joint and the middle of a shape, well within the hand's shapes."""
+
+    body: int  # Body in whose frame it is fixed
+    start: Float[np.ndarray, "3"]  # [m]
+    end: Float[np.ndarray, "3"]  # The end that is farther from the palm [m]
+    beyond: float  # How far the finger goes on from there [m]
+
+
+def pierced(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, " n"]:
+    """How much of a finger is behind a surface that its axis crosses, in each configuration [m]; 0 where none crosses."""
+    model, behind = scene.model, np.zeros(len(qpos))
+    data, groups = mujoco.MjData(model), (np.arange(mujoco.mjNGROUP) == OBJECT_GROUP).astype(np.uint8)
+    for i, q in enumerate(qpos):
+        data.qpos[:] = np.nan_to_num(q)
+        mujoco.mj_kinematics(model, data)
+        for bone in bones(scene):
+            place, turn = data.xpos[bone.body], data.xmat[bone.body].reshape(3, 3)
+            along = turn @ (bone.end - bone.start)
+            hit = mujoco.mj_ray(model, data, place + turn @ bone.start, along, groups, False, -1, None)
+            if 0 <= hit <= 1:
+                behind[i] = max(behind[i], (1 - hit) * float(np.linalg.norm(along)) + bone.beyond)
+    return behind
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def bones(scene: TrialScene) -> tuple[Bone, ...]:
+    """The axes of the fingers, from link to link."""
+    rest = _Rest(scene)
+    return tuple(bone for body in rest.bodies for own in rest.shapes[body] for before in rest.shapes.get(rest.parent(body), ())
+                 for bone in rest.between(body, before, own))
+
+
+class _Rest:
+    """The hand at rest, in which axes are sought."""
+
+    def __init__(self, scene: TrialScene) -> None:
+        self.model = model = scene.model
+        self.data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.data)
+        self.bodies = [b for b in range(1, model.nbody) if b != scene.object_body and model.body_mocapid[b] < 0]
+        solid = (model.geom_contype | model.geom_conaffinity) > 0
+        self.shapes = {b: [int(g) for g in np.nonzero((model.geom_bodyid == b) & solid)[0]] for b in self.bodies}
+
+    def parent(self, body: int) -> int:
+        return int(self.model.body_parentid[body])
+
+    def between(self, body: int, before: int, own: int) -> tuple[Bone, ...]:
+        """From the middle of a shape of the parent to that of one of the link; nothing where that way leaves the hand."""
+        first, last = self.data.geom_xpos[before], self.data.geom_xpos[own]
+        joint = self._joint(body, first, last)
+        parent, solid = self.parent(body), [*self.shapes[self.parent(body)], *self.shapes[body]]
+        if joint is None or not self._runs_within(np.stack([first, joint, last]), solid):
+            return ()
+        onward = self._reach(body, last)
+        rest = float(np.linalg.norm(last - joint))
+        near = Bone(parent, self._local(parent, first), self._local(parent, joint), rest + onward)
+        far = Bone(body, self._local(body, joint), self._local(body, last), onward)
+        return tuple(bone for bone in (near, far) if np.linalg.norm(bone.end - bone.start) > SPACING)
+
+    def _local(self, body: int, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        return self.data.xmat[body].reshape(3, 3).T @ (point - self.data.xpos[body])
+
+    def _joint(
+        self, body: int, first: Float[np.ndarray, "3"], last: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """The point of a hinge's axis that is next to the line between two points; None for a slide, the middle for neither."""
+        kinds = [int(self.model.jnt_type[j]) for j in np.nonzero(self.model.jnt_bodyid == body)[0]]
+        if not kinds:
+            return (first + last) / 2
+        if kinds[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            return None
+        hinge = int(self.model.body_jntadr[body])
+        axis, anchor, line = self.data.xaxis[hinge], self.data.xanchor[hinge], last - first
+        normal = np.cross(axis, line)
+        if normal @ normal < 1e-6 * (line @ line):  # along each other
+            return anchor + axis * (axis @ ((first + last) / 2 - anchor))
+        return anchor + axis * (np.cross(first - anchor, line) @ normal / (normal @ normal))
+
+    def _reach(self, body: int, point: Float[np.ndarray, "3"]) -> float:
+        """How far the finger goes on from a point of a link, to the middle of its farthest shape [m]."""
+        below = [b for b in self.bodies if self._is_below(b, body)]
+        return max((float(np.linalg.norm(self.data.geom_xpos[g] - point)) for b in below for g in self.shapes[b]), default=0.0)
+
+    def _is_below(self, body: int, other: int) -> bool:
+        """Whether a body hangs from another."""
+        while body > 0:
+            body = self.parent(body)
+            if body == other:
+                return True
+        return False
+
+    def _runs_within(self, path: Float[np.ndarray, "k 3"], solid: list[int]) -> bool:
+        """Whether a path is well within the shapes, but for a gap between links."""
+        outside = 0.0
+        for start, end in itertools.pairwise(path):
+            count = max(2, math.ceil(float(np.linalg.norm(end - start)) / SPACING))
+            for point in np.linspace(start, end, count):
+                outside = 0.0 if any(self._is_deep(shape, point) for shape in solid) else outside + SPACING
+                if outside > GAP:
+                    return False
+        return True
+
+    def _is_deep(self, shape: int, point: Float[np.ndarray, "3"]) -> bool:
+        """Whether a point is well inside a convex shape: there, and only there, rays to all sides go a long way."""
+        return all(self._ray(shape, point, side) >= DEEP for side in SIDES)
+
+    def _ray(self, shape: int, point: Float[np.ndarray, "3"], side: Float[np.ndarray, "3"]) -> float:
+        model, data, kind = self.model, self.data, self.model.geom_type[shape]
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            return mujoco.mj_rayMesh(model, data, shape, point, side, None)
+        return mujoco.mju_rayGeom(data.geom_xpos[shape], data.geom_xmat[shape], model.geom_size[shape], point, side, kind, None)
+
+
+SIDES = np.concatenate([np.eye(3), -np.eye(3)])  # Both ways along each axis
