@@ -171,7 +171,7 @@ class Rows:
         features, score, outcomes, hand, pair, settled = [], [], [], [], [], []
         for number, path in enumerate(sorted(folder.glob("*.pt"))):
             for part in torch.load(path, weights_only=True):
-                state = GraspState(**part["state"])
+                state = GraspState(**{"pierced": torch.zeros(len(part["state"]["shift"]))} | part["state"])
                 known = Evidence(**{f.name: part[f.name] for f in fields(Evidence) if f.name != "state"}, state=state)
                 n = len(part["score"])
                 features.append(holding_features(part["score"], known))

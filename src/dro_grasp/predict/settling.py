@@ -192,7 +192,7 @@ def _judged(
 ) -> Settled:
     """The grasps, of these rows the better ones that hold still, and what closing showed."""
     hand, obj = problem.hand, problem.solid
-    depth = deepest_penetration(hand, obj, better, config.protocol)
+    depth = torch.maximum(deepest_penetration(hand, obj, better, config.protocol), state.pierced)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     stable = torch.zeros_like(moved, dtype=torch.bool).index_fill(0, rows[holds], True)
     payload = observed(better.payload, state.gave, config.weight.pull * obj.mass, config.protocol)

@@ -20,6 +20,7 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, servo_torques
+from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
@@ -49,6 +50,7 @@ class GraspState(Rows):
     turn: Float[Tensor, " n"]  # how far it turned the object [rad]
     speed: Float[Tensor, " n"]  # how fast the object still moves [m/s]
     spin: Float[Tensor, " n"]  # how fast it still turns [rad/s]
+    pierced: Float[Tensor, " n"]  # how far a finger sticks through the object [m]
     contacts: Float[Tensor, " n"]  # number of contact points of hand and object
     links: Float[Tensor, " n"]  # number of links that touch the object
     pressure: Float[Tensor, " n"]  # sum of the normal forces [N]
@@ -195,7 +197,7 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     columns = {
         "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
-        "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
+        "pierced": pierced(scene, rollout.qpos), "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
         "pressure": [c.pressure.sum() for c in found],
         "slip": [c.slip for c in found],
     }

@@ -61,7 +61,7 @@ class TrialResult:
     fingers_in_contact: Int[Tensor, " n"]
     """Number of the hand's fingers that touch the object after closing."""
     penetration: Float[Tensor, " n"]
-    """Deepest penetration of hand and object in the labelled grasp [m]. What is pierced, there or once the hand is closed, counts
+    """Deepest penetration of hand and object in the labelled grasp [m]. What is pierced, then or once the hand is closed, is
     as deep as the finger is long behind it."""
     self_penetration: Float[Tensor, " n"]
     """Summed penetration of hand links in the labelled grasp [m]."""

@@ -81,7 +81,9 @@ class _Rest:
         rest = float(np.linalg.norm(last - joint))
         near = Bone(parent, self._local(parent, first), self._local(parent, joint), rest + onward)
         far = Bone(body, self._local(body, joint), self._local(body, last), onward)
-        return tuple(bone for bone in (near, far) if np.linalg.norm(bone.end - bone.start) > SPACING)
+        # In a palm, which has several fingers, the way to a joint runs along the surface.
+        inside = (far,) if sum(self.parent(b) == parent for b in self.bodies) > 1 else (near, far)
+        return tuple(bone for bone in inside if np.linalg.norm(bone.end - bone.start) > SPACING)
 
     def _local(self, body: int, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         return self.data.xmat[body].reshape(3, 3).T @ (point - self.data.xpos[body])
