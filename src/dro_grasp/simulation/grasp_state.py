@@ -197,9 +197,9 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     columns = {
         "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
-        "pierced": pierced(scene, rollout.qpos), "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
-        "pressure": [c.pressure.sum() for c in found],
-        "slip": [c.slip for c in found],
+        "pierced": pierced(scene, rollout.qpos),
+        "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
+        "pressure": [c.pressure.sum() for c in found], "slip": [c.slip for c in found],
     }
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}

@@ -31,7 +31,8 @@ from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 
-FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "pierced": 0.0, "contacts": 9.0, "links": 5.0, "pressure": 20.0, "slip": 0.5}
+FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "pierced": 0.0,
+        "contacts": 9.0, "links": 5.0, "pressure": 20.0, "slip": 0.5}
 """A grasp that holds."""
 
 
