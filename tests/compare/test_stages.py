@@ -93,7 +93,7 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
     for stage, best in ((RAW, RANKED), (REFINED, BEST), (SETTLED, SETTLED_BEST)):
         grasps, held_still = made if stage == RAW else refine(problem, made), torch.ones(len(made), dtype=torch.bool)
         if stage == SETTLED:
-            grasps, held_still, _ = settle_grasps(problem, grasps)
+            grasps, held_still, *_ = settle_grasps(problem, grasps)
         strict, first = simulate(hand, obj, grasps, "strict"), simulate(hand, obj, grasps, "dro")
         order = torch.where(held_still, scored(problem, grasps).score, -9.0).argsort(descending=True)
         share, share_best, share_first = (

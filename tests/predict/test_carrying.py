@@ -77,7 +77,7 @@ def test_what_is_asked_replaces_what_is_configured() -> None:
 
 
 def test_settled_grasps_state_payload_and_forces(grasps: dro.GraspBatch) -> None:
-    found, stable, _ = settle_grasps(GraspProblem(HAND, CAN), grasps, HELD)
+    found, stable, *_ = settle_grasps(GraspProblem(HAND, CAN), grasps, HELD)
     assert stable.any()
     for name in ("payload", "squeeze_force", "squeeze_torque"):
         known = getattr(found, name).reshape(len(found), -1).isfinite().all(1)
@@ -108,7 +108,7 @@ def test_what_cannot_carry_the_mass_scores_less(grasps: dro.GraspBatch) -> None:
 def test_what_held_the_mass_as_it_settled_carries_it_at_least(grasps: dro.GraspBatch) -> None:
     for obj in (CAN, with_mass(CAN, 1.5)):
         problem = GraspProblem(HAND, obj)
-        found, stable, known = settle_grasps(problem, grasps)
+        found, stable, known, _ = settle_grasps(problem, grasps)
         settled, rules, gave = found[stable], PROTOCOLS["carry"], known.state.gave[stable]
         held = (gave[:, 0] < rules.max_displacement) & (gave[:, 1] < rules.max_rotation)
         assert torch.equal(settled.payload >= obj.mass, held)

@@ -57,7 +57,7 @@ def naive(problem: GraspProblem, made: Candidates, keep: int) -> tuple[GraspBatc
     ranked = sorted(range(len(passed)), key=lambda row: -float(known.score[row]))
     better = sorted(ranked[: max(round(0.5 * len(passed)), min(keep, len(passed)))])
     before = known[torch.tensor(better, dtype=torch.long)]
-    closed, stable, known_of = settle_grasps(problem, before)
+    closed, stable, known_of, _ = settle_grasps(problem, before)
     good = stable & feasible(problem, closed)
     poses = [(closed if bool(good[i]) else before)[i : i + 1] for i in range(len(better))]
     done = GraspBatch.concatenate([pose.without("score") for pose in poses])

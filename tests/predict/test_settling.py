@@ -28,17 +28,19 @@ from dro_grasp.predict.settling import (
     DEEP,
     FORBIDDEN,
     GIVES_WAY,
+    JAMMED,
     SettleConfig,
     Settled,
     can_settle,
     doubts,
     effort_share,
+    is_jammed,
     settle_best,
     settle_grasps,
 )
 from dro_grasp.predict.stages import evaluate, grip, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import press
+from dro_grasp.simulation.grasp_state import Squeeze, press
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from tests.helpers.loaded_hands import loaded_hand
@@ -77,7 +79,7 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
     still, lost = moved < 0.004, moved > 0.06
     pushed = (moved > 0.0055) & (moved < 0.03)
     assert min(int(rows.sum()) for rows in (still, pushed, lost)) > 0
-    found, stable, known = outcome
+    found, stable, known, _ = outcome
     assert bool(stable[still].all()), "with this can they are not deep either"
     pressed = press(HAND, CAN, grip(PROBLEM, closed[still], RefineConfig()), "strict")
     for name in ("T_object_wrist", "joints", "squeeze_joints"):
@@ -102,7 +104,7 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
 def test_what_moves_turns_or_penetrates_more_than_the_limit_stays_as_it_was(
     many: GraspBatch, outcome: Settled, quantity: str
 ) -> None:
-    found, stable, known = outcome
+    found, stable, known, _ = outcome
     rows = stable.nonzero()[:, 0]
     state = known.state.rows(stable)
     values = deepest_penetration(HAND, CAN, found[stable]) if quantity == "depth" else getattr(state, quantity)
@@ -138,7 +140,7 @@ def test_a_hand_has_moved_as_far_as_its_grasp_centre(grasps: GraspBatch) -> None
 
 
 def test_settled_grasps_hardly_push_the_object_away(many: GraspBatch, outcome: Settled) -> None:
-    found, stable, _ = outcome
+    found, stable, *_ = outcome
     before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[stable]))
     assert before.failure.count(Failure.PUSHED_AWAY) > 2
     assert after.failure.count(Failure.PUSHED_AWAY) <= 1
@@ -166,15 +168,17 @@ def test_doubts_say_what_closing_showed(outcome: Settled) -> None:
     gave, state = outcome.known.state.gave.clone(), outcome.known.state
     gave[rows] = torch.tensor([[0.0, 0.0], [0.021, 0.0], [0.0, math.radians(16)]])
     wrong = torch.zeros_like(outcome.stable).index_fill(0, rows[:1], True)
-    found = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong, SettleConfig())
+    found = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong, outcome.jammed, SettleConfig())
     assert [found[i] for i in rows] == [FORBIDDEN, GIVES_WAY, GIVES_WAY]
     for why, moved, stable in zip(found, outcome.known.moved, outcome.stable, strict=True):
         assert (why == AWAY) == (not moved < 0.05)
         assert stable or why
     assert AWAY in found
     gave[rows] = 0.0
-    held = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong & False, SettleConfig())
+    held = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong & False, outcome.jammed, SettleConfig())
     assert [held[i] for i in rows] == [""] * 3
+    jammed = doubts(outcome.known, wrong & False, torch.ones_like(wrong), SettleConfig())
+    assert {jammed[i] for i in rows} == {JAMMED}
 
 
 def test_effort_is_that_of_the_joint_that_is_nearest_to_its_limit() -> None:
@@ -231,9 +235,21 @@ def test_on_a_bare_cloud_grasps_settle_where_they_do_on_the_mesh_and_get_no_tria
     assert hand_shift(HAND, on_mesh.grasps[both], on_balls.grasps[both]).median() < 0.003
     turned = [made.grasps.T_object_wrist[both, :3, :3] for made in (on_mesh, on_balls)]
     assert roma.rotmat_geodesic_distance(*turned).median() < 0.1
-    gap = [p.field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(1) for p, (g, _, _) in (
+    gap = [p.field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(1) for p, (g, *_) in (
         (whole, on_mesh), (whole, on_balls))]
     assert (gap[0] - gap[1])[both].abs().max() < 0.003  # balls are some 1 mm low
     for _ in range(2):  # nothing that settling has built is found instead
         with pytest.raises(ObjectError, match="is a bare point cloud; a trial needs a mesh"):
             evaluate(bare, on_balls.grasps)
+
+
+def test_what_no_torque_of_the_joints_explains_is_jammed() -> None:
+    """Two joints of 0.1 Nm with a lever of 2 cm press with 10 N; four weights of 1 kg and 5 N may be there beside."""
+    torque = torch.zeros(4, HAND.tree.n_dof)
+    torque[1:, :2] = torch.tensor([0.1, -0.1])
+    most = torch.tensor([0.0, 10.0, 10.0, 10.0]) + 4 * 9.81 + 5
+    squeeze = Squeeze(torque, most + torch.tensor([-0.1, -0.1, 0.1, 100.0]))
+    assert bool(HAND.movable[:2].all())
+    assert is_jammed(HAND, 1.0, squeeze, 0.02).tolist() == [False, False, True, True]
+    sliding = HAND.tree.joint_unit
+    assert is_jammed(HAND, 1.0, Squeeze(torque / sliding, squeeze.force), 0.02).tolist() == [False, False, True, True]

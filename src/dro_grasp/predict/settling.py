@@ -36,12 +36,16 @@ from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
 
 AWAY = "push it away as they close"  # The object is lost at the first closing
 DEEP = "reach into it"  # The hand is too deep in the object, or in itself
+JAMMED = "jam it between parts that do not move"  # No torque of the joints explains how hard it is pressed
 MOVES = "move it as they close"  # The second closing moves the object too far
 TURNS = "turn it as they close"  # It turns it too far
 FORBIDDEN = "end where the constraints forbid"  # What closing left violates a constraint
 GIVES_WAY = "give way under its weight"  # The weight then moves or turns the object farther than the protocol allows
-DOUBTS = (AWAY, DEEP, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
+DOUBTS = (AWAY, DEEP, JAMMED, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
 """What closing shows against a grasp, in the order in which the first is told."""
+WEIGHTS = 4.0  # Weights of the object by which it may be pressed without any torque (ours)
+SLIGHT = 5.0  # Force that counts as nothing [N] (ours)
+GRAVITY = 9.81  # [m/s^2]
 
 
 @renamed(room_worth="clearance_worth")
@@ -61,6 +65,9 @@ class SettleConfig(Checked):
     """How far it may move the last time [m]."""
     largest_turn: float = math.radians(30)
     """How far it may turn then [rad]."""
+    shortest_lever: float = 1 / 60
+    """Shortest lever with which joints press [m]. An object that is pressed harder is jammed, as a rim in a cleft of the hand,
+    which only soft contacts allow: usual grasps press with 5 to 20 cm, jammed ones with less than 4 mm."""
     deepest: float = 0.005
     """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
     unstable_score: float = -3.0
@@ -92,6 +99,7 @@ class Settled(NamedTuple):
     grasps: GraspBatch  # all of them, in their order
     stable: Bool[Tensor, " n"]  # which ones hold still, with no link too deep in the object or in another
     known: Evidence  # what closing showed of all of them
+    jammed: Bool[Tensor, " n"]  # which ones no torque of the joints explains
 
 
 def can_settle(problem: GraspProblem) -> bool:
@@ -128,21 +136,24 @@ def settle_best(
     # The score, which is learned from objects that hang in the air, does not tell which of several pinches lifts.
     count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, stable, known = settle_grasps(problem, grasps[best], config)
+    closed, stable, known, jammed = settle_grasps(problem, grasps[best], config)
     wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
-    return SettledBest(best, closed.replace(score=found), doubts(known, wrong, config))
+    return SettledBest(best, closed.replace(score=found), doubts(known, wrong, jammed, config))
 
 
-def doubts(known: Evidence, wrong: Bool[Tensor, " n"], config: SettleConfig) -> tuple[str, ...]:
+def doubts(
+    known: Evidence, wrong: Bool[Tensor, " n"], jammed: Bool[Tensor, " n"], config: SettleConfig
+) -> tuple[str, ...]:
     """What closing showed against each grasp, in words; empty for nothing."""
     state = known.state
-    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, MOVES: state.shift >= config.farthest,
-             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives_way(state)}
+    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, JAMMED: jammed,
+             MOVES: state.shift >= config.farthest, TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong,
+             GIVES_WAY: gives_way(state)}
     return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
@@ -193,12 +204,14 @@ def _judged(
     """The grasps, of these rows the better ones that hold still, and what closing showed."""
     hand, obj = problem.hand, problem.solid
     depth = torch.maximum(deepest_penetration(hand, obj, better, config.protocol), state.pierced)
-    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
+    jam = is_jammed(hand, obj.mass, squeeze, config.shortest_lever)
+    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest) & ~jam
     stable = torch.zeros_like(moved, dtype=torch.bool).index_fill(0, rows[holds], True)
     payload = observed(better.payload, state.gave, config.weight.pull * obj.mass, config.protocol)
     better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force, payload=payload)
     known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), state)
-    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable))
+    jammed = torch.zeros_like(stable).index_fill(0, rows[jam], True)
+    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable), jammed)
 
 
 def weigh_settled(
@@ -214,6 +227,12 @@ def weigh_settled(
         return found
     pulled, before = asked.pull * problem.solid.mass, grasps.payload
     return torch.where(before < pulled, found.clamp_max(LESS * pulled), found.clamp_min(pulled))
+
+
+def is_jammed(hand: Hand, mass: float, squeeze: Squeeze, shortest_lever: float) -> Bool[Tensor, " n"]:
+    """Whether the object is pressed harder than the joints do with this lever [m], and than some of its weights [kg] would."""
+    made = (squeeze.torque * hand.movable * hand.tree.joint_unit).abs().sum(1) / shortest_lever
+    return squeeze.force > made + WEIGHTS * GRAVITY * mass + SLIGHT
 
 
 def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:

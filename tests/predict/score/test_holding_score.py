@@ -119,7 +119,7 @@ def test_a_file_with_a_number_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None:
     hand, obj = loaded_hand("gripper3"), load_object("hammer")
     problem = GraspProblem(hand, obj)
-    grasps, rows, known = settle_grasps(problem, refine(problem, synthesize(hand, obj, 128, 5)))
+    grasps, rows, known, _ = settle_grasps(problem, refine(problem, synthesize(hand, obj, 128, 5)))
     grasps = scored(problem, grasps[rows])
     holds = simulate(hand, obj, grasps, "carry").success
     assert 20 < int(holds.sum()) < len(holds) - 20
