@@ -78,7 +78,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     table = Table(title=title, title_justify="left")
     for column in compress(columns, told):
         words = column in {"name", "hand", "object", "reason", "from"}
-        table.add_column(column, overflow="fold", justify="left" if words else "right")
+        table.add_column(column, overflow="fold", justify="left" if words else "right", no_wrap=column == "origin")
     for row in cells:
         table.add_row(*compress(row, told))
     stdout.print(table)

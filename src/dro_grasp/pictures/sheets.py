@@ -203,7 +203,7 @@ def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
 
 def _told(grasps: GraspBatch) -> str:
     """Number and outcome of grasps."""
-    text = f"{len(grasps)} grasps"
+    text = f"{len(grasps)} grasp" + "s" * (len(grasps) != 1)
     if not bool(grasps.evaluated.any()):
         return text
     protocols = sorted({p for p in grasps.protocol if p})
