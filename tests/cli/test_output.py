@@ -36,6 +36,17 @@ def test_long_names_are_folded_and_never_cut(capsys: pytest.CaptureFixture[str])
     assert said.count("x") == 120
 
 
+def test_the_names_of_usual_sources_are_not_broken(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dro_grasp.cli.output.stdout.width", 60)
+    head = ["grasp", "origin", "confidence", "carries [kg]", "squeeze [N]", "success", "contacts", "penetration [mm]"]
+    for name, whole in (("optimiser", True), ("my_module_of_grasps:MySource", False)):
+        print_table("t", head, [[0, name, "99 %", 1.2, 14, True, 6, 1.2]])
+        said = capsys.readouterr().out
+        assert (name in said) == whole
+        assert "…" not in said
+        assert all(letter in said for letter in name), "folded, and not cut"
+
+
 @pytest.mark.parametrize("score", [-3.0, -0.2, 0.0, 1.0, 2.823, 1e4, -1e4])
 def test_a_score_is_shown_as_the_probability_that_it_states(score: float) -> None:
     grasps = made_up_grasps(toy_hand(), count=1).replace(score=torch.tensor([score]))

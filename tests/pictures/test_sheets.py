@@ -161,6 +161,7 @@ def test_captions_and_heading_tell_what_was_tried(hand, obj, grasps) -> None:
     assert heading(hand, obj, grasps) == "gripper3 on sphere: 3 grasps, 1 of 2 succeeded (dro/1)"
     untried = grasps.without_trial()
     assert heading(hand, obj, untried) == "gripper3 on sphere: 3 grasps"
+    assert heading(hand, obj, untried[:1]) == "gripper3 on sphere: 1 grasp"
 
 
 def test_a_picture_that_cannot_be_finished_leaves_the_old_one(

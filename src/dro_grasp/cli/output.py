@@ -18,6 +18,7 @@ stderr = Console(stderr=True, highlight=False, markup=False)
 
 
 NOTHING = ("", "-")  # Cells without a value
+SHORT = 12  # Letters of the name of a source up to which it is not broken
 
 
 def say(text: str) -> None:
@@ -76,9 +77,10 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     cells = [[_cell(value) for value in row] for row in rows]
     told = [not cells or any(row[i] not in NOTHING for row in cells) for i in range(len(columns))]
     table = Table(title=title, title_justify="left")
-    for column in compress(columns, told):
+    for i, column in compress(enumerate(columns), told):
         words = column in {"name", "hand", "object", "reason", "from"}
-        table.add_column(column, overflow="fold", justify="left" if words else "right", no_wrap=column == "origin")
+        short = column == "origin" and all(len(row[i]) <= SHORT for row in cells)
+        table.add_column(column, overflow="fold", justify="left" if words else "right", no_wrap=short)
     for row in cells:
         table.add_row(*compress(row, told))
     stdout.print(table)
