@@ -138,7 +138,7 @@ MEASUREMENTS = {
         for hand in ("allegro", "barrett")}),
     "flat": Measurement("Flat and thin things on a table, from above, carried", {
         _short(hand): f"python -m lab.benchmarks.tabletop --hands {hand} --objects ballpoint_pen bank_card dinner_plate "
-        "table_fork hardcover_book scissors --num 8 --sides above --trials --protocol carry --json" for hand in FLAT_HANDS}),
+        "table_fork hardcover_book scissors --num 8 --sides above --trials carry --json" for hand in FLAT_HANDS}),
     "methods": Measurement("Methods of others, written anew here, beside ours", {
         f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages raw returned "
                                                 f"--protocols {FAST} dro")
