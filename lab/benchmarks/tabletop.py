@@ -1,6 +1,6 @@
 """Grasps of objects that rest on a table, from above and from the side: how many are returned, how soon, and how far above it.
 
-    python -m lab.benchmarks.tabletop [--hands allegro barrett] [--objects mug soap] [--source auto] [--trials] [--json]
+    python -m lab.benchmarks.tabletop [--hands allegro barrett] [--objects mug soap] [--source auto] [--trials carry] [--json]
 
 Every object lies in its most probable stable pose on a table. The clearance is that of the lowest vertex of the hand's
 collision shapes, in pregrasp, grasp and squeeze, of all grasps together; no stage of the prediction reads these shapes.
@@ -123,8 +123,7 @@ def main() -> None:
     for hand in map(load_hand, options.hands):
         for name in resolve_objects(options.objects):
             obj = resting(load_object(name))
-            protocol = options.protocol if options.trials else None
-            rows += [measure(predictor, hand, obj, side, request, protocol) for side in options.sides]
+            rows += [measure(predictor, hand, obj, side, request, options.trials) for side in options.sides]
     whole, summary = [row.returned == options.num for row in rows], {}
     for hand in options.hands:
         for side in options.sides:
