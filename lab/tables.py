@@ -23,7 +23,7 @@ from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import ALL, Row, average
 from lab import pages
 from lab.benchmarks.report import ROOT
-from lab.measurements import MEASUREMENTS, ROBOTS
+from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS
 from lab.runner import RESULTS
 from lab.studies import payload
 
@@ -255,6 +255,32 @@ def sides(results: Results) -> str:
     return table(["", "asked", "returned", "`carry` [%]", "least clearance [mm]", "median CPU [s]"], lines)
 
 
+def flat(results: Results) -> str:
+    """What is flat or thin, on a table, by hand."""
+    names = list(dict.fromkeys(r["object"] for cell in results.cells("flat").values() for r in cell["rows"]))
+    lines = []
+    for hand, cell in results.cells("flat").items():
+        rows = {r["object"]: r for r in cell["rows"]}
+        asked, returned, held = (sum(r[key] or 0 for r in rows.values()) for key in ("asked", "returned", "held"))
+        lines.append([hand, *(f"{rows[name]['held']}/{rows[name]['returned']}" for name in names), of(held, asked),
+                      of(held, returned), f"{sorted(r['cpu'] for r in rows.values())[len(rows) // 2]:.0f}"])
+    columns = ["", *(name.replace("_", " ") for name in names), "of asked [%]", "of returned [%]", "median CPU [s]"]
+    return table(columns, lines)
+
+
+def confidence(results: Results) -> str:
+    """Predicted beside observed, in ten bins, of hands that no weights were trained on."""
+    lines = []
+    for k in range(10):
+        own = [b for name, cell in results.cells("confidence").items() if not name.startswith(tuple(map(plain, PAPER_HANDS)))
+               for b in cell["bins"] if round(10 * b["from"]) == k]
+        n = sum(b["n"] for b in own)
+        if n:
+            predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
+            lines.append([f"{10 * k} to {10 * k + 10}", n, f"{100 * predicted / n:.0f}", of(round(held), n)])
+    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]"], lines)
+
+
 def methods(results: Results) -> str:
     """Methods of others beside ours, and what the paper says of them."""
     lines = []
@@ -442,6 +468,8 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "lifts.robots": lifts,
     "constraints.cost": constraints,
     "tables.sides": sides,
+    "flat.things": flat,
+    "confidence.bins": confidence,
     "methods.others": methods,
     "fidelity.form": fidelity,
     "fidelity.simulation": simulation,
