@@ -22,6 +22,7 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
+from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
 from dro_grasp.hands.description.reduction import keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
 from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
@@ -61,6 +62,8 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     notes.extend(keep_hand_only(spec, path, fixed_base=arm))
     model = compile_hand(spec, path, notes)
+    if not arm:
+        model = lightened(spec, model, path, notes)
     tree = read_tree(model, path, notes)
     return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
 
@@ -139,9 +142,10 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     included = included_files(root, path)
     if path.suffix.lower() != ".xml":
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
-    with mujoco_speaks_to(notes, path):
-        spec = mujoco.MjSpec.from_file(str(path))
-    if not any("angle" in c.attrib for tree in (root, *map(parse_xml, included)) for c in tree.iter("compiler")):
+    trees = {path: root, **{file: parse_xml(file) for file in included}}
+    spec = _spec_of(trees, path, notes)
+    mend_empty_inertials(spec, notes)
+    if not any("angle" in c.attrib for tree in trees.values() for c in tree.iter("compiler")):
         notes.extend(guess_unit(spec))
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
@@ -151,6 +155,23 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
                         "there or correct meshdir and texturedir")
     return spec, (*included, *meshes)
+
+
+def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
+    """What MuJoCo reads from a file and those that it includes, mended in memory where MuJoCo would not read them."""
+    mended = [mend_mjcf_inertials(tree, notes) for tree in trees.values()]
+    with mujoco_speaks_to(notes, path):
+        if not any(mended):
+            return mujoco.MjSpec.from_file(str(path))
+        text, *more = (ET.tostring(tree) for tree in trees.values())
+        names = [os.path.relpath(file, path.parent) for file in trees if file != path]
+        spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
+    spec.modelfiledir = str(path.parent)
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
+        if asset.file and beside.is_file() and not (path.parent / (folder or "") / asset.file).is_file():
+            asset.file = str(beside)
+    return spec
 
 
 def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:

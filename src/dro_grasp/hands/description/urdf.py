@@ -15,6 +15,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.files import reading
 from dro_grasp.geometry.mesh_files import open_mesh
 from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
+from dro_grasp.hands.description.inertials import mend_urdf_inertials
 from dro_grasp.hands.description.xml_files import DEEPEST
 
 MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one degree of freedom
@@ -29,6 +30,7 @@ def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, 
     _check_names(root, path)
     _settle_joints(root, path, notes)
     _drop_empty_shapes(root, path, notes)
+    mend_urdf_inertials(root, notes)
     base = _check_links(root, path)
     if base == "world":
         for place, attribute in (("link", "name"), ("joint/parent", "link"), ("joint/child", "link")):
