@@ -133,7 +133,7 @@ class Description:
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
     xml, files, converted = prepare_urdf(root, path, notes)
-    assets = {name: as_obj(file) for name, file in converted.items()}
+    assets = {name: as_obj(file, notes) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
         return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
 

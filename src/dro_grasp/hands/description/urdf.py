@@ -222,14 +222,19 @@ def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> 
     return True
 
 
-def as_obj(file: Path) -> bytes:
-    """A mesh in any format trimesh reads, as OBJ text."""
+def as_obj(file: Path, notes: list[Note]) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text in metres; another unit that the file states is noted."""
     import trimesh
 
     # trimesh alone is called here, and its many readers raise whatever they stumble over.
     with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
         loaded = open_mesh(file)
+        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        if not math.isclose(unit, 1.0):
+            mesh.apply_scale(unit)
+            told = Note("info", file.name, f"states that its unit is {unit:g} m, and is taken so")
+            notes.extend([] if told in notes else [told])
         return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
 
 
