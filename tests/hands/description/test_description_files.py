@@ -108,7 +108,7 @@ def test_meshes_are_found_under_encoded_uris(tmp_path, name):
     mesh.write_bytes(b"x")
     assert find_mesh(name, tmp_path / "my hand") == mesh
     assert find_mesh(f"file://{tmp_path}/my%20hand/meshes/left%20tip%231.stl", Path("/")) == mesh
-    assert find_mesh("meshes/left%20tip%231.stl", tmp_path / "my hand") is None, "a plain path is no URI"
+    assert find_mesh("meshes/left%20tip%231.stl", tmp_path / "my hand") == mesh, "though a plain path is no URI"
     literal.write_bytes(b"x")
     assert find_mesh(name.replace("my%20hand", "my hand"), tmp_path / "my hand") == literal, "the very name comes first"
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from urllib.parse import unquote
 
 import mujoco
 import numpy as np
@@ -23,9 +24,9 @@ from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
 from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
-from dro_grasp.hands.description.reduction import keep_hand_only
+from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
-from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
+from dro_grasp.hands.description.urdf import CONTINUOUS, as_obj, in_any_case, prepare_urdf
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
@@ -60,7 +61,9 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
             stated = open_key(spec)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    notes.extend(keep_hand_only(spec, path, fixed_base=arm))
+    in_vain = {note.subject for note in notes if CONTINUOUS in note.text and not arm}
+    notes.extend(note for note in keep_hand_only(spec, path, fixed_base=arm)
+                 if not (note.text.startswith(NO_LIMITS) and note.subject in in_vain))
     model = compile_hand(spec, path, notes)
     if not arm:
         model = lightened(spec, model, path, notes)
@@ -139,7 +142,7 @@ def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
-    included = included_files(root, path)
+    path, included = _with_included(root, path)
     if path.suffix.lower() != ".xml":
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
     trees = {path: root, **{file: parse_xml(file) for file in included}}
@@ -147,6 +150,7 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     mend_empty_inertials(spec, notes)
     if not any("angle" in c.attrib for tree in trees.values() for c in tree.iter("compiler")):
         notes.extend(guess_unit(spec))
+    _find_files(spec, path, notes)
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
@@ -155,6 +159,28 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
                         "there or correct meshdir and texturedir")
     return spec, (*included, *meshes)
+
+
+def _with_included(root: ET.Element, path: Path) -> tuple[Path, tuple[Path, ...]]:
+    """An MJCF and the files that it includes; where it is a link and they lie beside its target, the target."""
+    try:
+        return path, included_files(root, path)
+    except HandError:
+        if not path.is_symlink():
+            raise
+        return path.resolve(), included_files(root, path.resolve())
+
+
+def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Point meshes and textures, in place, to files that lie beside a link's target or are spelled in another case."""
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        if not asset.file or os.path.isfile(path.parent / (folder or "") / asset.file):
+            continue
+        likely = [parent / (folder or "") / unquote(asset.file) for parent in (path.parent, path.resolve().parent)]
+        file = next(filter(None, map(in_any_case, likely)), None)
+        if file is not None:
+            notes.append(Note("warning", asset.file, f"was not found, and {file.resolve()} is taken for it"))
+            asset.file = str(file.resolve())
 
 
 def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:

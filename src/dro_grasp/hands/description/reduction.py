@@ -156,6 +156,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
     """Give unlimited joints limits; refuse ball joints, inner free joints, and more joints than any hand has."""
     if (count := len(list(spec.joints))) > MAX_JOINTS:
         raise HandError(f"{path} has {count} joints; expected at most {MAX_JOINTS}, fix those that are not the hand's")
+    _hold_joints_without_range(spec, path, notes)
     for joint in spec.joints:
         if joint.type in {mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE}:
             kind = "ball" if joint.type == mujoco.mjtJoint.mjJNT_BALL else "free"
@@ -165,11 +166,35 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
         if not limited:
             slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
             limit = SLIDE_LIMIT if slides else CONTINUOUS_LIMIT
+            vain = f" that count ({told})" if (told := _told_range(joint.range)) else ""
             # Angles are in the unit of the file, and compiled from there.
             stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
             joint.range = [-stated, stated]
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-            notes.append(Note("warning", joint.name, f"{NO_LIMITS}; taken as +-{limit:.2f}"))
+            notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
+
+
+def _told_range(limits: Sequence[float]) -> str:
+    """Limits that a joint states but that do not count, in words; empty if it states none."""
+    low, high = limits
+    return "" if low == high == 0 else f"{low:g} to {high:g}" + ("" if low >= high else ", but limited is 'false'")
+
+
+def _hold_joints_without_range(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Hold joints, in place, that are limited to one value, which MuJoCo refuses. HandError: no other joint moves."""
+    still = [j for j in spec.joints if j.limited == mujoco.mjtLimited.mjLIMITED_TRUE and j.range[0] == j.range[1]]
+    if still and len(still) == len(list(spec.joints)):
+        raise HandError(f"{path} has no moving joint: both limits of {len(still)} joints are equal "
+                        f"({', '.join(joint.name for joint in still[:3])}{', ...' if len(still) > 3 else ''}); state their limits")
+    led = {equality.name1 for equality in spec.equalities if is_linear(equality)}
+    for joint in still:
+        unit = math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        value = float(joint.range[0])
+        joint.range = [value - STILL * unit, value + STILL * unit]
+        notes.append(Note("warning", joint.name, f"has both limits at {value:g} and is held there"))
+        if joint.name not in led:
+            tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.name)
+            tie.data[0] = (value - float(joint.ref)) / unit
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
