@@ -27,6 +27,7 @@ from dro_grasp.hands.description.inertials import lightened, mend_empty_inertial
 from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
 from dro_grasp.hands.description.urdf import CONTINUOUS, as_obj, in_any_case, prepare_urdf
+from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
@@ -59,6 +60,7 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
             spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
             stated = open_key(spec)
+        spec = spec if link is not None else with_palm_of_world(spec, path, notes)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     in_vain = {note.subject for note in notes if CONTINUOUS in note.text and not arm}
