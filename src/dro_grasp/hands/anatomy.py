@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
-from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
+from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
 if TYPE_CHECKING:
     from dro_grasp.hands.description.tree_reading import LinkGeometry
@@ -201,7 +201,7 @@ class _End:
     link: int  # its topmost link, in whose frame the rest is
     vertices: Float[np.ndarray, "n 3"]  # corners of its shapes [m]
     anchor: Place  # a point on the axis of its joint [m]
-    axis: Place
+    axis: Place | None  # its direction; None for the three hinges of a ball joint
 
     def has(self, pin: Place) -> bool:
         """Whether a point is at this link."""
@@ -209,8 +209,8 @@ class _End:
         return bool(((pin >= low) & (pin <= high)).all())
 
     def lever(self, pin: Place) -> float:
-        """Distance of a point from the axis of this link's own joint [m]."""
-        return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
+        """Distance of a point from the axis of this link's own joint, or from the middle of its ball [m]."""
+        return float(np.linalg.norm(pin - self.anchor if self.axis is None else np.cross(pin - self.anchor, self.axis)))
 
 
 def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkGeometry]) -> dict[int, int]:
@@ -240,7 +240,19 @@ def _end(tree: KinematicTree, tip: int, poses: Float[np.ndarray, "n_links 4 4"],
     to_link = np.linalg.inv(poses[link])
     fixed = [(to_link @ poses[shape.link], shape.vertices) for shape in geometry if group[shape.link] == link]
     corners = np.concatenate([vertices @ T[:3, :3].T + T[:3, 3] for T, vertices in fixed])
-    return _End(tip, link, corners, tree.anchor[link].double().numpy(), tree.axis[link].double().numpy())
+    axis = None if _is_ball(tree, link) else tree.axis[link].double().numpy()
+    return _End(tip, link, corners, tree.anchor[link].double().numpy(), axis)
+
+
+def _is_ball(tree: KinematicTree, link: int) -> bool:
+    """Whether a link turns about three axes through one point."""
+    above = tree.parent[link]
+    for lower, upper in ((link, above), (above, tree.parent[above] if above >= 0 else -1)):
+        if upper < 0 or not tree.kind[lower] == tree.kind[upper] == REVOLUTE:
+            return False
+        if not torch.equal(tree.origin[lower], torch.eye(4)) or not torch.equal(tree.anchor[lower], tree.anchor[upper]):
+            return False
+    return True
 
 
 def _are_pinned(poses: Float[np.ndarray, "k n_links 4 4"], first: _End, second: _End) -> bool:
