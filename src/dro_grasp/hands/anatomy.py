@@ -30,6 +30,9 @@ FEWEST_WITH_THUMB = 4  # Hands with fewer fingers have no thumb: their fingers a
 THUMB_CLOSING = 0.55
 """Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
 every hand with four or five fingers, built in or among the development assets (ten hands)."""
+ABOUT_AS_OPPOSED = 0.25
+"""Opposition by which another finger may exceed the one that is named a thumb (ours). Of seven hands, thumbs exceed their
+fingers by 0.3 to 1.0."""
 MAX_FINGERS = 24  # Most fingers of a hand (ours): two hands of a humanoid, and its feet
 LONGEST_FINGER = 12
 """Most joints of one finger (ours): to find which way they close, every combination of their directions is tried."""
@@ -148,9 +151,15 @@ def measure_opposition(
     return -(direction * others).sum(-1)
 
 
-def find_thumb(opposition: Float[Tensor, " n_tips"]) -> int | None:
-    """The finger with the largest thumb opposition; None for hands with too few fingers to have a thumb."""
-    return None if len(opposition) < FEWEST_WITH_THUMB else int(opposition.argmax())
+def find_thumb(opposition: Float[Tensor, " n_tips"], named: int | None = None) -> int | None:
+    """The finger with the largest thumb opposition, or the one that is named so if it has about as much.
+
+    None for hands with too few fingers to have a thumb.
+    """
+    if len(opposition) < FEWEST_WITH_THUMB:
+        return None
+    most = int(opposition.argmax())
+    return most if named is None or float(opposition[most] - opposition[named]) > ABOUT_AS_OPPOSED else named
 
 
 def closing_gains(
