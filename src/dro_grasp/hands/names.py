@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 SIDES = {"left": ({"left", "lh", "lft", "links"}, "l"), "right": ({"right", "rh", "rgt", "rechts"}, "r")}
 """Words that name a side, and the letter that does where most links begin or end with it (ours)."""
 THUMB = {"thumb", "th", "daumen", "pouce", "pollex"}  # Words that name a thumb (ours)
-SPREADS = {"aa", "abd", "add", "abduction", "adduction", "abad", "splay", "spread"}  # Words of joints that spread fingers (ours)
 MOST = 0.5  # Share of links that must have a side's letter (ours)
 
 
@@ -32,8 +31,3 @@ def named_thumb(fingers: Sequence[Sequence[str]]) -> int | None:
     """The one finger one of whose own links is called a thumb; None if there is none, or several."""
     found = [number for number, links in enumerate(fingers) if any(THUMB & set(words_of(link)) for link in links)]
     return found[0] if len(found) == 1 else None
-
-
-def names_spreading(joint: str) -> bool:
-    """Whether a joint's name says that it spreads fingers."""
-    return bool(SPREADS & set(words_of(joint)))

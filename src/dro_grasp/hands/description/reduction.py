@@ -139,6 +139,9 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
     for tendon in spec.tendons:
         wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
+        if tendon.name in driven and (pulled := _pulled(tendon)):
+            notes.append(Note("warning", tendon.name, f"is a tendon over sites that an actuator pulls; what it moves "
+                              f"({', '.join(pulled)}) is taken as free: state by <equality> how these joints follow each other"))
         if tendon.name not in driven or len(wraps) < 2:
             continue
         first = wraps[0]
@@ -152,6 +155,21 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
             equality.data[:2] = [0.0, first.coef / other.coef]
             notes.append(Note("info", other.target.name, f"shares tendon '{tendon.name}' with "
                               f"'{first.target.name}' and moves with it"))
+
+
+def _pulled(tendon: mujoco.MjsTendon) -> list[str]:
+    """Names of the joints between the sites of a spatial tendon; empty for one that runs over joints, or over one of them."""
+    paths = []
+    for wrap in tendon.path:
+        if wrap.type != mujoco.mjtWrap.mjWRAP_SITE or wrap.target is None:
+            continue
+        body, path = wrap.target.parent, []
+        while body is not None and body.name != "world":
+            path, body = [body, *path], body.parent
+        paths.append({each.name: [joint.name for joint in each.joints] for each in path})
+    shared = set.intersection(*map(set, paths)) if paths else set()
+    between = {joint: None for path in paths for name, joints in path.items() if name not in shared for joint in joints}
+    return list(between) if len(between) > 1 else []
 
 
 def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
