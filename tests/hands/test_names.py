@@ -52,7 +52,8 @@ def test_the_thumb_judges_names_of_sides(tmp_path: Path) -> None:
     assert report.facts["side"] == "right"
     assert [note.text for note in report.notes if "by its names" in note.text] == [
         "is that of a left hand by its names and of a right hand by its thumb, which counts. Is the palm direction right?"]
-    assert not [note for note in check_hand(written(tmp_path, bracket_urdf(1.0), "right_hand.urdf")).notes if "names" in note.text]
+    right = check_hand(written(tmp_path, bracket_urdf(1.0), "right_hand.urdf"))
+    assert not [note for note in right.notes if "names" in note.text]
 
 
 def test_a_thumb_in_names() -> None:
@@ -62,7 +63,8 @@ def test_a_thumb_in_names() -> None:
 
 
 @pytest.mark.parametrize(("opposition", "named", "thumb"), [
-    ([0.5, 0.3, -0.6, -0.5], 1, 1), ([0.5, 0.3, -0.6, -0.5], None, 0), ([0.9, -0.4, -0.5, -0.3], 1, 0), ([0.5, 0.4, 0.3], 1, None)])
+    ([0.5, 0.3, -0.6, -0.5], 1, 1), ([0.5, 0.3, -0.6, -0.5], None, 0), ([0.9, -0.4, -0.5, -0.3], 1, 0),
+    ([0.5, 0.4, 0.3], 1, None)])
 def test_geometry_judges_the_name_of_a_thumb(opposition: list[float], named: int | None, thumb: int | None) -> None:
     assert find_thumb(torch.tensor(opposition), named) == thumb
 

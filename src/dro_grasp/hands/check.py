@@ -83,8 +83,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *_side_notes(hand), *opening_notes(hand),
-             *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *_side_notes(hand),
+             *opening_notes(hand), *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -95,7 +95,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         f"{tree.moving_names[c.follower]} = {c.multiplier:g} * {tree.moving_names[c.leader]} + {c.offset:g}"
         if c.leader >= 0 else f"{tree.moving_names[c.follower]} = {c.offset:g}" for c in description.couplings
     ]
-    joints, movable = tree.joint_names, hand.movable.tolist()
+    joints, movable, opened = tree.joint_names, hand.movable.tolist(), hand.canonical_joints(1.0).tolist()
     return {
         "file": description.source,
         "wrist_link": hand.wrist_link,
@@ -111,7 +111,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "held_joints": [n for n, m in zip(joints, movable, strict=True) if not m],
         "coupled_joints": couplings,
         "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
-        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, hand.canonical_joints(1.0).tolist(), movable, strict=True) if m},
+        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, opened, movable, strict=True) if m},
         "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
         "effort": {n: round(x, 3) for n, x, m in zip(joints, find_efforts(hand).limit.tolist(), movable, strict=True) if m},
         "contact_links": [names[i] for i in hand.contact_links],
@@ -164,8 +164,8 @@ def _side_notes(hand: Hand) -> list[Note]:
     seen, named_so = seen_side(hand), _side_in_names(hand)
     if seen is None or named_so in (None, seen):
         return []
-    return [Note("warning", hand.tree.link_names[hand.palm], f"is that of a {named_so} hand by its names and of a {seen} hand by "
-                 "its thumb, which counts. Is the palm direction right?")]
+    return [Note("warning", hand.tree.link_names[hand.palm], f"is that of a {named_so} hand by its names and of a {seen} hand "
+                 "by its thumb, which counts. Is the palm direction right?")]
 
 
 def _part_notes(hand: Hand, description: Description) -> list[Note]:

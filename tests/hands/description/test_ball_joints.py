@@ -140,6 +140,7 @@ def test_a_hand_on_a_ball_is_free(tmp_path: Path) -> None:
 
 
 def test_a_ball_before_another_joint_of_its_link_is_refused(tmp_path: Path) -> None:
-    body = "<body name='f' pos='0 0 .02'><joint name='ball' type='ball'/><joint name='hinge' range='0 1'/><geom size='.01'/></body>"
+    body = "<body name='f' pos='0 0 .02'><joint name='ball' type='ball'/>" \
+           "<joint name='hinge' range='0 1'/><geom size='.01'/></body>"
     with pytest.raises(HandError, match="joint 'ball' is a ball joint before another joint of link 'f'"):
         load_description(written(tmp_path, mjcf(body), "hand.xml"))

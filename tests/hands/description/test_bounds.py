@@ -19,7 +19,8 @@ from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 FINGER = ('<body name="f{0}" pos="{0}e-3 0 0"><joint name="j{0}" axis="0 1 0" range="0 1"/>'
           '<geom type="capsule" size="0.007" fromto="0 0 0 0 0 0.05" mass="0.1"/></body>')
 ATTACHED = '<body name="q"><attach model="m" body="{0}" prefix="x"/></body>'
-HEAVY = '<inertial><origin xyz="0 0 1e30"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+HEAVY = '<inertial><origin xyz="0 0 1e30"/><mass value="1"/>' \
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
 
 def mjcf(more: str = "", before: str = "", after: str = "") -> str:

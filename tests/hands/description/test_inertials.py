@@ -82,7 +82,8 @@ def test_an_mjcf_with_a_wrong_inertial_is_read(tmp_path: Path, stated: str, word
 
 def test_a_wrong_inertial_of_an_included_file_is_mended_and_meshes_are_found(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
-    tetrahedron = "".join(f"v {x}\n" for x in ("0 0 0", ".01 0 0", "0 .01 0", "0 0 .01")) + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    tetrahedron = "".join(f"v {x}\n" for x in ("0 0 0", ".01 0 0", "0 .01 0", "0 0 .01"))
+    tetrahedron += "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     written(tmp_path / "parts", tetrahedron, "nail.obj")
     written(tmp_path / "parts", "<mujoco><compiler meshdir='meshes'/><asset><mesh name='nail' file='nail.obj'/></asset>"
             "<worldbody><body name='more'><inertial mass='1' diaginertia='1 1 1'/><joint range='0 1'/><geom type='mesh' "

@@ -7,7 +7,6 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import LEAST_MASS, Note, compile_hand
 from dro_grasp.hands.description.reduction import CONTINUOUS_LIMIT, keep_hand_only
 

@@ -16,11 +16,13 @@ BOX = "<geom type='box' size='.006 .006 .02' pos='0 0 .02'/>"
 
 def mjcf(path: str, actuator: str, more: str = "") -> str:
     fingers = "".join(
-        f"<body name='{n}1' pos='{x} 0 .01'><joint name='{n}_a' axis='0 {s} 0' range='0 1.4'/>{BOX}<site name='{n}_s1' pos='0 0 .02'/>"
-        f"<body name='{n}2' pos='0 0 .04'><joint name='{n}_b' axis='0 {s} 0' range='0 1.4'/>{BOX}<site name='{n}_s2' pos='0 0 .02'/>"
+        f"<body name='{n}1' pos='{x} 0 .01'><joint name='{n}_a' axis='0 {s} 0' range='0 1.4'/>{BOX}"
+        f"<site name='{n}_s1' pos='0 0 .02'/>"
+        f"<body name='{n}2' pos='0 0 .04'><joint name='{n}_b' axis='0 {s} 0' range='0 1.4'/>{BOX}"
+        f"<site name='{n}_s2' pos='0 0 .02'/>"
         "</body></body>" for n, x, s in (("l", -0.035, 1), ("r", 0.035, -1)))
-    return (f"<mujoco><compiler angle='radian'/><worldbody><body name='palm'><geom type='box' size='.04 .04 .01'/><site name='root'/>"
-            f"{fingers}</body></worldbody><tendon>{path}</tendon><actuator>{actuator}</actuator>{more}</mujoco>")
+    return (f"<mujoco><compiler angle='radian'/><worldbody><body name='palm'><geom type='box' size='.04 .04 .01'/>"
+            f"<site name='root'/>{fingers}</body></worldbody><tendon>{path}</tendon><actuator>{actuator}</actuator>{more}</mujoco>")
 
 
 OVER_SITES = "<spatial name='cord'><site site='root'/><site site='l_s1'/><site site='l_s2'/></spatial>"

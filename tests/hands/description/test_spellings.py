@@ -1,4 +1,4 @@
-"""Files whose words are not quite right: expressions that nobody expanded, lost meshes, limits that say nothing, a root `world`."""
+"""Files whose words are not quite right: expressions of a template, lost meshes, limits that say nothing, a root `world`."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ def test_expressions_in_names_and_in_what_nobody_reads_do_not_matter(tmp_path: P
 
 
 @pytest.mark.parametrize(("name", "at"), [
-    ("Meshes/Tip.STL", "meshes/tip.stl"), ("meshes/tip.stl", "Meshes/tip.STL"), ("package://my_hand/meshes/TIP.stl", "meshes/tip.stl"),
-    ("meshes/left%20tip.stl", "meshes/left tip.stl"), ("meshes%2Ftip.stl", "meshes/tip.stl"), ("MESHES/a%20b.stl", "meshes/A b.stl")])
+    ("Meshes/Tip.STL", "meshes/tip.stl"), ("meshes/tip.stl", "Meshes/tip.STL"),
+    ("package://my_hand/meshes/TIP.stl", "meshes/tip.stl"),
+    ("meshes/left%20tip.stl", "meshes/left tip.stl"), ("meshes%2Ftip.stl", "meshes/tip.stl"),
+    ("MESHES/a%20b.stl", "meshes/A b.stl")])
 def test_meshes_in_other_spellings_are_found_and_told(tmp_path: Path, name: str, at: str) -> None:
     mesh = tip(tmp_path / "my_hand" / at)
     description = load_description(written(tmp_path / "my_hand", meshed(name)))
@@ -68,8 +70,8 @@ def test_the_very_name_comes_first(tmp_path: Path) -> None:
     assert not load_description(written(tmp_path, meshed("tip.stl"))).notes
 
 
-MJCF = ("<mujoco><compiler angle='radian' meshdir='meshes'/><asset><mesh name='tip' file='{}'/></asset><worldbody><body name='palm'>"
-        "<geom type='box' size='.04 .04 .01'/><body name='left' pos='-.035 0 .01'><joint name='a' axis='0 1 0' range='0 1.5'/>"
+MJCF = ("<mujoco><compiler angle='radian' meshdir='meshes'/><asset><mesh name='tip' file='{}'/></asset><worldbody>"
+        "<body name='palm'><geom type='box' size='.04 .04 .01'/><body name='left' pos='-.035 0 .01'><joint name='a' axis='0 1 0' range='0 1.5'/>"
         "<geom type='mesh' mesh='tip' pos='0 0 .03'/></body><body name='right' pos='.035 0 .01'><joint name='b' axis='0 -1 0' "
         "range='0 1.5'/><geom type='mesh' mesh='tip' pos='0 0 .03'/></body></body></worldbody></mujoco>")
 
@@ -158,9 +160,12 @@ RADIAN = "angle='radian'"
 
 
 @pytest.mark.parametrize(("compiler", "limits", "value"), [
-    (RADIAN, "limited='true' range='0 0'", 0.0), (RADIAN, "limited='true'", 0.0), (RADIAN, "limited='true' range='.4 .4' ref='.1'", 0.4),
+    (RADIAN, "limited='true' range='0 0'", 0.0), (RADIAN, "limited='true'", 0.0),
+    (RADIAN, "limited='true' range='.4 .4' ref='.1'", 0.4),
     ("angle='degree'", "limited='true' range='30 30' ref='10'", np.radians(30))])
-def test_a_joint_of_an_mjcf_that_is_limited_to_one_value_is_held(tmp_path: Path, compiler: str, limits: str, value: float) -> None:
+def test_a_joint_of_an_mjcf_that_is_limited_to_one_value_is_held(
+    tmp_path: Path, compiler: str, limits: str, value: float
+) -> None:
     other = "range='0 1.5'" if compiler == RADIAN else "range='0 86'"
     description = load_description(written(tmp_path, RANGES.format(compiler=compiler, a=limits, b=other), "hand.xml"))
     assert description.tree.joint_names == ("b",)

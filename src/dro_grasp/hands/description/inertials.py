@@ -69,7 +69,8 @@ def lightened(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path, notes: lis
     of_shapes = compile_hand(by_shape, path, [])
     wrong = [b for b in doubted if wide[b] or mass[b] > DENSEST * of_shapes.body_mass[b]]
     for b in wrong:
-        name, stated = model.body(b).name, f"an inertia of {inertia[b]:.3g} kg m^2" if wide[b] else "more than its shapes would weigh in gold"
+        name, too_much = model.body(b).name, "more than its shapes would weigh in gold"
+        stated = f"an inertia of {inertia[b]:.3g} kg m^2" if wide[b] else too_much
         _take_from_shapes(spec.body(name))
         notes.append(Note("warning", name, f"states a mass of {mass[b]:.3g} kg, {stated}; both are taken from its shapes"))
     return compile_hand(spec, path, []) if wrong else model
@@ -81,8 +82,8 @@ def mend_empty_inertials(spec: mujoco.MjSpec, notes: list[Note]) -> None:
         stated = body.explicitinertial and len(body.geoms) and math.isnan(body.fullinertia[0])
         if stated and body.mass >= 0 and not (body.mass > 0 and (np.asarray(body.inertia) > 0).all()):
             _take_from_shapes(body)
-            notes.append(Note("warning", body.name or "inertial", "has an <inertial> that is left out, as its mass or inertia is "
-                              f"not above zero; its mass {SHAPED}"))
+            notes.append(Note("warning", body.name or "inertial", "has an <inertial> that is left out, as its mass or inertia "
+                              f"is not above zero; its mass {SHAPED}"))
 
 
 def _take_from_shapes(body: mujoco.MjsBody) -> None:

@@ -84,11 +84,11 @@ def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[
     for ball in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_BALL]:
         body, name = ball.parent, ball.name
         if list(body.joints)[-1] != ball:
-            raise HandError(f"{path}: joint '{name}' is a ball joint before another joint of link '{body.name}'; expected it last, "
-                            "or three hinges")
+            raise HandError(f"{path}: joint '{name}' is a ball joint before another joint of link '{body.name}'; expected "
+                            "it last, or three hinges")
         limit = float(ball.range[1]) or (math.degrees(BALL_LIMIT) if spec.compiler.degree else BALL_LIMIT)
-        stated = {"pos": ball.pos.copy(), "stiffness": ball.stiffness, "range": [-limit, limit], "actfrclimited": ball.actfrclimited,
-                  "actfrcrange": ball.actfrcrange.copy(), "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
+        stated = {"pos": ball.pos.copy(), "stiffness": ball.stiffness, "range": [-limit, limit],
+                  "actfrclimited": ball.actfrclimited, "actfrcrange": ball.actfrcrange.copy(), "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
         names = [f"{name}_{letter}" for letter in "xyz"]
         spec.delete(ball)
         for each, axis in zip(names, np.eye(3), strict=True):
@@ -141,7 +141,7 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
         wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
         if tendon.name in driven and (pulled := _pulled(tendon)):
             notes.append(Note("warning", tendon.name, f"is a tendon over sites that an actuator pulls; what it moves "
-                              f"({', '.join(pulled)}) is taken as free: state by <equality> how these joints follow each other"))
+                              f"({', '.join(pulled)}) is taken as free: state by <equality> how these joints follow"))
         if tendon.name not in driven or len(wraps) < 2:
             continue
         first = wraps[0]
@@ -227,7 +227,8 @@ def _hold_joints_without_range(spec: mujoco.MjSpec, path: Path, notes: list[Note
     still = [j for j in spec.joints if j.limited == mujoco.mjtLimited.mjLIMITED_TRUE and j.range[0] == j.range[1]]
     if still and len(still) == len(list(spec.joints)):
         raise HandError(f"{path} has no moving joint: both limits of {len(still)} joints are equal "
-                        f"({', '.join(joint.name for joint in still[:3])}{', ...' if len(still) > 3 else ''}); state their limits")
+                        f"({', '.join(joint.name for joint in still[:3])}{', ...' if len(still) > 3 else ''}); "
+                        "state their limits")
     led = {equality.name1 for equality in spec.equalities if is_linear(equality)}
     for joint in still:
         unit = math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
@@ -331,7 +332,8 @@ def _led_by_fingers(
     if not set(leaders) <= own or any(len(sweep) < 2 for sweep in others.values()):
         return sweeps
     motors = " and ".join(linkage.model.joint(j).name for j in sweeps)
-    notes.extend(Note("warning", name, f"is moved by {motors} together; grasps state its values, not theirs") for name in leaders)
+    told = f"is moved by {motors} together; grasps state its values, not theirs"
+    notes.extend(Note("warning", name, told) for name in leaders)
     return others
 
 

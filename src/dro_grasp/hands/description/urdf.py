@@ -87,7 +87,8 @@ def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
             if kind != "continuous":
                 _check_limits(joint, path, notes)
             elif (stated := joint.find("limit")) is not None and {"lower", "upper"} <= stated.attrib.keys():
-                notes.append(Note("warning", name, f"states limits of {stated.get('lower')} to {stated.get('upper')}, {CONTINUOUS}"))
+                told = f"states limits of {stated.get('lower')} to {stated.get('upper')}, {CONTINUOUS}"
+                notes.append(Note("warning", name, told))
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -156,7 +157,8 @@ def _check_links(root: ET.Element, path: Path) -> str:
         still = [joint.get("name", "") for joint in joints if _has_no_range(joint)]
         raise HandError(f"{path} has no moving joint ({len(joints)} fixed); a hand needs at least one revolute or prismatic "
                         "joint" + (f". Both limits of {len(still)} joints are zero ({', '.join(still[:3])}"
-                                   f"{', ...' if len(still) > 3 else ''}), so they cannot move: state their limits" if still else ""))
+                                   f"{', ...' if len(still) > 3 else ''}), so they cannot move: state their limits"
+                                   if still else ""))
     parent: dict[str, str] = {}
     for joint in joints:
         above, below = (_link_of(joint, end, links, path) for end in ("parent", "child"))

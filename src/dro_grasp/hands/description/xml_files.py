@@ -61,8 +61,8 @@ def _refuse_expressions(root: ET.Element, path: Path) -> None:
         for element in part.iter() if part.tag in {"link", "joint", "group_state"} or root.tag == "mujoco" else ():
             for attribute, value in element.attrib.items():
                 if "${" in value and attribute not in NAMES:
-                    raise HandError(f"{path}: <{element.tag}> of {part.tag} '{part.get('name', '')}' has {attribute}=\"{value[:60]}\", "
-                                    f"an expression of xacro; {_expanding(path)}")
+                    raise HandError(f"{path}: <{element.tag}> of {part.tag} '{part.get('name', '')}' has "
+                                    f"{attribute}=\"{value[:60]}\", an expression of xacro; {_expanding(path)}")
 
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
