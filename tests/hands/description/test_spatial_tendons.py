@@ -22,7 +22,8 @@ def mjcf(path: str, actuator: str, more: str = "") -> str:
         f"<site name='{n}_s2' pos='0 0 .02'/>"
         "</body></body>" for n, x, s in (("l", -0.035, 1), ("r", 0.035, -1)))
     return (f"<mujoco><compiler angle='radian'/><worldbody><body name='palm'><geom type='box' size='.04 .04 .01'/>"
-            f"<site name='root'/>{fingers}</body></worldbody><tendon>{path}</tendon><actuator>{actuator}</actuator>{more}</mujoco>")
+            f"<site name='root'/>{fingers}</body></worldbody>"
+            f"<tendon>{path}</tendon><actuator>{actuator}</actuator>{more}</mujoco>")
 
 
 OVER_SITES = "<spatial name='cord'><site site='root'/><site site='l_s1'/><site site='l_s2'/></spatial>"

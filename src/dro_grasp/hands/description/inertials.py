@@ -12,6 +12,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.hands.description.compiling import Note, compile_hand
 
@@ -92,7 +93,7 @@ def _take_from_shapes(body: mujoco.MjsBody) -> None:
         geom.mass = math.nan
 
 
-NO_MASS = "its mass is not above zero"
+NO_MASS = "its mass is not above zero"  # What is wrong with an inertial, in words
 
 
 def _fault_of_urdf(inertial: ET.Element) -> str:
@@ -132,7 +133,7 @@ def _full(inertia: ET.Element | None) -> list[float] | None:
     return [value[0] for value in found if value] if found and all(found) else None
 
 
-def _moments(full: list[float]) -> np.ndarray:
+def _moments(full: list[float]) -> Float[np.ndarray, "3"]:
     xx, yy, zz, xy, xz, yz = full
     return np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 

@@ -88,7 +88,8 @@ def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[
                             "it last, or three hinges")
         limit = float(ball.range[1]) or (math.degrees(BALL_LIMIT) if spec.compiler.degree else BALL_LIMIT)
         stated = {"pos": ball.pos.copy(), "stiffness": ball.stiffness, "range": [-limit, limit],
-                  "actfrclimited": ball.actfrclimited, "actfrcrange": ball.actfrcrange.copy(), "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
+                  "actfrclimited": ball.actfrclimited, "actfrcrange": ball.actfrcrange.copy(),
+                  "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
         names = [f"{name}_{letter}" for letter in "xyz"]
         spec.delete(ball)
         for each, axis in zip(names, np.eye(3), strict=True):

@@ -14,7 +14,7 @@ from dro_grasp.hands.description.compiling import Note, mujoco_speaks_to
 APART = 0.4  # Largest distance between the bases of two fingers of a hand [m] (ours)
 LARGEST_PALM = 0.3  # Largest radius of a sphere around a shape of a palm [m] (ours); tables and walls are larger
 NEAR = 0.1  # Largest distance of a palm's shape from the base of a finger [m] (ours)
-SCENERY = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+SCENERY = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)  # Shapes of no palm (ours)
 
 
 def with_palm_of_world(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.MjSpec:
