@@ -71,8 +71,8 @@ def test_the_very_name_comes_first(tmp_path: Path) -> None:
 
 
 MJCF = ("<mujoco><compiler angle='radian' meshdir='meshes'/><asset><mesh name='tip' file='{}'/></asset><worldbody>"
-        "<body name='palm'><geom type='box' size='.04 .04 .01'/><body name='left' pos='-.035 0 .01'><joint name='a' axis='0 1 0' range='0 1.5'/>"
-        "
+        "<body name='palm'><geom type='box' size='.04 .04 .01'/><body name='left' pos='-.035 0 .01'>"
+        "<joint name='a' axis='0 1 0' range='0 1.5'/>"
         "<geom type='mesh' mesh='tip' pos='0 0 .03'/></body><body name='right' pos='.035 0 .01'><joint name='b' axis='0 -1 0' "
         "range='0 1.5'/><geom type='mesh' mesh='tip' pos='0 0 .03'/></body></body></worldbody></mujoco>")
 

@@ -124,7 +124,8 @@ def _fault_of_mjcf(stated: Mapping[str, str]) -> str:
         return "it is incomplete or has words for numbers"
     if {"diaginertia", "fullinertia"} <= read.keys():
         return "it states two inertias"
-    return _impossible(read["fullinertia"]) if read.get("fullinertia") else ""
+    full = read.get("fullinertia")
+    return _impossible(full) if full else ""
 
 
 def _full(inertia: ET.Element | None) -> list[float] | None:

@@ -83,12 +83,13 @@ def _leave_out_scenery(
         away = np.linalg.norm(bases - data.geom_xpos[geom], axis=1).min() - model.geom_rbound[geom]
         return model.geom_type[geom] not in SCENERY and model.geom_rbound[geom] < LARGEST_PALM and bool(away < NEAR)
 
-    for geom, near in zip(list(spec.worldbody.geoms), map(is_near, np.flatnonzero(model.geom_bodyid == 0)), strict=True):
+    of_world = np.flatnonzero(model.geom_bodyid == 0).tolist()
+    for geom, near in zip(list(spec.worldbody.geoms), map(is_near, of_world), strict=True):
         if not near:
             spec.delete(geom)
     others = [body for body in spec.worldbody.bodies if body not in fingers]
     for body, number in zip(others, _numbers_of(spec, others), strict=True):
-        its = np.flatnonzero(model.body_rootid[model.geom_bodyid] == number)
+        its = np.flatnonzero(model.body_rootid[model.geom_bodyid] == number).tolist()
         if body.find_all("joint") or body.mocap or not any(map(is_near, its)):
             notes.append(Note("info", body.name or "body", "is not part of the hand and is left out"))
             spec.delete(body)
