@@ -23,6 +23,7 @@ from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
 from dro_grasp.hands.library import load_hand_description
+from dro_grasp.hands.names import named_side
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.usable_range import range_notes
 
@@ -32,6 +33,7 @@ COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "directio
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
+FEWEST_WITH_SIDE = 3  # Hands with fewer fingers are on no side, whatever they are called (ours)
 SAME_WAY = 0.9  # Cosine from which on jaws move the same way (ours)
 END = {1: "upper", -1: "lower"}  # Limit at which a joint is open, by opening sign
 THIN_VOLUME = 1e-9  # Volume below which a link's shapes enclose nothing [m^3] (ours)
@@ -81,8 +83,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *opening_notes(hand),
-             *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *_side_notes(hand),
+             *opening_notes(hand), *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -93,7 +95,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         f"{tree.moving_names[c.follower]} = {c.multiplier:g} * {tree.moving_names[c.leader]} + {c.offset:g}"
         if c.leader >= 0 else f"{tree.moving_names[c.follower]} = {c.offset:g}" for c in description.couplings
     ]
-    joints, movable = tree.joint_names, hand.movable.tolist()
+    joints, movable, opened = tree.joint_names, hand.movable.tolist(), hand.canonical_joints(1.0).tolist()
     return {
         "file": description.source,
         "wrist_link": hand.wrist_link,
@@ -109,7 +111,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "held_joints": [n for n, m in zip(joints, movable, strict=True) if not m],
         "coupled_joints": couplings,
         "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
-        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, hand.open_ends.tolist(), movable, strict=True) if m},
+        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, opened, movable, strict=True) if m},
         "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
         "effort": {n: round(x, 3) for n, x, m in zip(joints, find_efforts(hand).limit.tolist(), movable, strict=True) if m},
         "contact_links": [names[i] for i in hand.contact_links],
@@ -133,15 +135,37 @@ def _rigid_groups(hand: Hand) -> list[list[str]]:
 
 
 def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm."""
+    """`left`, `right`, or `none`: by its thumb, or else by the names of its links and its file."""
+    return seen_side(hand) or _side_in_names(hand) or "none"
+
+
+def seen_side(hand: Hand) -> str | None:
+    """The side that the thumb is on; None for a hand without a thumb or with fingers all around the palm."""
     if hand.thumb is None:
-        return "none"
+        return None
     tips, palm = FingerMotion.of(hand).tips(hand.canonical_joints(1.0)), hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
     # With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
-    return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+    return None if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+
+
+def _side_in_names(hand: Hand) -> str | None:
+    if len(hand.fingers) < FEWEST_WITH_SIDE:
+        return None
+    links = [hand.tree.link_names[i] for i in hand.contact_links]
+    file = () if hand.description is None or hand.description.link is not None else (hand.description.path.stem,)
+    return named_side(links, file)
+
+
+def _side_notes(hand: Hand) -> list[Note]:
+    """Names that tell of another side than the thumb."""
+    seen, named_so = seen_side(hand), _side_in_names(hand)
+    if seen is None or named_so in (None, seen):
+        return []
+    return [Note("warning", hand.tree.link_names[hand.palm], f"is that of a {named_so} hand by its names and of a {seen} hand "
+                 "by its thumb, which counts. Is the palm direction right?")]
 
 
 def _part_notes(hand: Hand, description: Description) -> list[Note]:

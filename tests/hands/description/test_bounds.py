@@ -19,7 +19,8 @@ from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 FINGER = ('<body name="f{0}" pos="{0}e-3 0 0"><joint name="j{0}" axis="0 1 0" range="0 1"/>'
           '<geom type="capsule" size="0.007" fromto="0 0 0 0 0 0.05" mass="0.1"/></body>')
 ATTACHED = '<body name="q"><attach model="m" body="{0}" prefix="x"/></body>'
-HEAVY = '<inertial><mass value="inf"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+HEAVY = '<inertial><origin xyz="0 0 1e30"/><mass value="1"/>' \
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
 
 def mjcf(more: str = "", before: str = "", after: str = "") -> str:
@@ -39,7 +40,7 @@ def limits(upper: str, kind: str = "revolute") -> str:
     (claw(joints=limits("50", "prismatic")), r"the limits of joint 'a' are 0 50 m; expected at most 10 m"),
     (claw(joints=limits("1").replace("0 0 0.01", "1e30 0 0")), r"the origin of link 'left' is 1e\+30 0 0"),
     (claw(joints=limits("1").replace("0 0 0.01", "nan 0 0")), r"the origin of link 'left' is nan 0 0"),
-    (claw(links=link("left").replace("<visual>", f"{HEAVY}<visual>") + link("right")), "link 'left' is"),
+    (claw(links=link("left").replace("<visual>", f"{HEAVY}<visual>") + link("right")), "centre of mass of link 'left' is"),
     (claw(joints=joint("a", "palm", "left", "0 0 0.01", more=LIMIT + '<mimic joint="b" multiplier="nan"/>')
           + joint("b", "palm", "right", "0.035 0 0.01")), "the coefficients of the coupling of joint 'a' is 0 nan"),
 ])

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from urllib.parse import unquote
 
 import mujoco
 import numpy as np
@@ -22,9 +23,11 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
-from dro_grasp.hands.description.reduction import keep_hand_only
+from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
+from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
-from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
+from dro_grasp.hands.description.urdf import CONTINUOUS, as_obj, in_any_case, prepare_urdf
+from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
@@ -57,10 +60,15 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
             spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
             stated = open_key(spec)
+        spec = spec if link is not None else with_palm_of_world(spec, path, notes)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    notes.extend(keep_hand_only(spec, path, fixed_base=arm))
+    in_vain = {note.subject for note in notes if CONTINUOUS in note.text and not arm}
+    notes.extend(note for note in keep_hand_only(spec, path, fixed_base=arm)
+                 if not (note.text.startswith(NO_LIMITS) and note.subject in in_vain))
     model = compile_hand(spec, path, notes)
+    if not arm:
+        model = lightened(spec, model, path, notes)
     tree = read_tree(model, path, notes)
     return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
 
@@ -130,19 +138,21 @@ class Description:
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
     xml, files, converted = prepare_urdf(root, path, notes)
-    assets = {name: as_obj(file) for name, file in converted.items()}
+    assets = {name: as_obj(file, notes) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
         return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
-    included = included_files(root, path)
+    path, included = _with_included(root, path)
     if path.suffix.lower() != ".xml":
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
-    with mujoco_speaks_to(notes, path):
-        spec = mujoco.MjSpec.from_file(str(path))
-    if not any("angle" in c.attrib for tree in (root, *map(parse_xml, included)) for c in tree.iter("compiler")):
+    trees = {path: root, **{file: parse_xml(file) for file in included}}
+    spec = _spec_of(trees, path, notes)
+    mend_empty_inertials(spec, notes)
+    if not any("angle" in c.attrib for tree in trees.values() for c in tree.iter("compiler")):
         notes.extend(guess_unit(spec))
+    _find_files(spec, path, notes)
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
@@ -151,6 +161,45 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
                         "there or correct meshdir and texturedir")
     return spec, (*included, *meshes)
+
+
+def _with_included(root: ET.Element, path: Path) -> tuple[Path, tuple[Path, ...]]:
+    """An MJCF and the files that it includes; where it is a link and they lie beside its target, the target."""
+    try:
+        return path, included_files(root, path)
+    except HandError:
+        if not path.is_symlink():
+            raise
+        return path.resolve(), included_files(root, path.resolve())
+
+
+def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Point meshes and textures, in place, to files that lie beside a link's target or are spelled in another case."""
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        if not asset.file or os.path.isfile(path.parent / (folder or "") / asset.file):
+            continue
+        likely = [parent / (folder or "") / unquote(asset.file) for parent in (path.parent, path.resolve().parent)]
+        file = next(filter(None, map(in_any_case, likely)), None)
+        if file is not None:
+            notes.append(Note("warning", asset.file, f"was not found, and {file.resolve()} is taken for it"))
+            asset.file = str(file.resolve())
+
+
+def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
+    """What MuJoCo reads from a file and those that it includes, mended in memory where MuJoCo would not read them."""
+    mended = [mend_mjcf_inertials(tree, notes) for tree in trees.values()]
+    with mujoco_speaks_to(notes, path):
+        if not any(mended):
+            return mujoco.MjSpec.from_file(str(path))
+        text, *more = (ET.tostring(tree) for tree in trees.values())
+        names = [os.path.relpath(file, path.parent) for file in trees if file != path]
+        spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
+    spec.modelfiledir = str(path.parent)
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
+        if asset.file and beside.is_file() and not (path.parent / (folder or "") / asset.file).is_file():
+            asset.file = str(beside)
+    return spec
 
 
 def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:

@@ -20,6 +20,8 @@ MAX_PIXELS = 10_000  # Most pixels of a generated texture along each side (ours)
 MAX_DIVISIONS = 200.0  # Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB
 UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
+NAMES = {"name", "link", "joint", "filename", "file", "mesh", "material", "class"}
+"""Attributes in which words stand, where a hand is read even if a template left its expressions there (ours)."""
 
 
 def parse_xml(path: Path) -> ET.Element:
@@ -44,9 +46,23 @@ def parse_xml(path: Path) -> ET.Element:
     assert root is not None  # an empty file is no XML
     _check_elements(root, path)
     if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()):
-        expanded = path.with_name("expanded.urdf")
-        raise HandError(f"{path} is a xacro template; expand it first: {command('xacro', path, '-o', expanded)}")
+        raise HandError(f"{path} is a xacro template; {_expanding(path)}")
+    _refuse_expressions(root, path)
     return root
+
+
+def _expanding(path: Path) -> str:
+    return f"expand it first: {command('xacro', path, '-o', path.with_name('expanded.urdf'))}"
+
+
+def _refuse_expressions(root: ET.Element, path: Path) -> None:
+    """Refuse expressions of a template where numbers stand; names may look like them, and so may what nobody reads."""
+    for part in root:
+        for element in part.iter() if part.tag in {"link", "joint", "group_state"} or root.tag == "mujoco" else ():
+            for attribute, value in element.attrib.items():
+                if "${" in value and attribute not in NAMES:
+                    raise HandError(f"{path}: <{element.tag}> of {part.tag} '{part.get('name', '')}' has "
+                                    f"{attribute}=\"{value[:60]}\", an expression of xacro; {_expanding(path)}")
 
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
