@@ -37,7 +37,8 @@ def cut_apart(
     """Convex parts of a closed mesh by `coacd` or `vhacd`, within some seconds of computing; CutShortError without any."""
     with TemporaryDirectory(prefix="dro-grasp-") as folder:
         source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
-        np.savez(source, vertices=mesh.vertices, faces=mesh.faces, **{k: np.array(v) for k, v in options.items()})
+        given = {"vertices": mesh.vertices, "faces": mesh.faces, **options}
+        np.savez(source, **{name: np.asarray(value) for name, value in given.items()})  # type: ignore[arg-type]
         _run([method, str(source), str(target), str(seconds)], spent)
         with np.load(target) as stored:
             found = [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(stored.files) // 2)]

@@ -10,6 +10,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 ENDS_WITH_PARENT = 1  # PR_SET_PDEATHSIG. Source: Linux's prctl(2)
 
@@ -30,14 +31,14 @@ def main(method: str, source: str, target: str, seconds: str) -> None:
                           for what, array in zip("vf", part, strict=True)})
 
 
-def _coacd(vertices: np.ndarray, faces: np.ndarray, options: dict[str, Any]) -> list[Any]:
+def _coacd(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], options: dict[str, Any]) -> list[Any]:
     import coacd
 
     coacd.set_log_level("error")
     return coacd.run_coacd(coacd.Mesh(vertices, faces), **options)
 
 
-def _vhacd(vertices: np.ndarray, faces: np.ndarray, options: dict[str, Any]) -> list[Any]:
+def _vhacd(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], options: dict[str, Any]) -> list[Any]:
     from vhacdx import compute_vhacd
 
     rows = np.column_stack([np.full(len(faces), 3), faces]).ravel().astype(np.uint32)  # as VTK writes polygons

@@ -55,8 +55,8 @@ def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 
     One point at the origin may be the object's; it is none if it is alone there, far from all others.
     """
-    finite = np.isfinite(points).all(1)
-    zero = (points == 0).all(1)
+    finite = np.asarray(np.isfinite(points).all(1))
+    zero = np.asarray((points == 0).all(1))
     others = points[finite & ~zero]
     if zero.sum() == 1 and (len(others) < FEW or np.abs(others).max(1).min() <= ALONE * np.ptp(others, axis=0).max()):
         return finite
@@ -194,7 +194,7 @@ def _ascii_rows(text: bytes, columns: list[int], count: int) -> Float[np.ndarray
 
 def _packed_columns(raw: bytes, layout: list[np.dtype], count: int) -> dict[str, Num[np.ndarray, "n width"]]:
     """Columns by their place, from compressed data of a PCD file: sizes after and before, then field after field."""
-    import lzf
+    import lzf  # type: ignore  # compiled, without types
 
     packed, size = struct.unpack_from("<II", raw)
     if size != count * sum(each.itemsize for each in layout):

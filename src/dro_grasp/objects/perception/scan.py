@@ -67,8 +67,8 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
 
 def _check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int) -> None:
     """Refuse a matrix that is no pinhole camera's, or that of an image of another size, by an ObjectError."""
-    expected = (f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of {width} x {height}, with the principal "
-                f"point (cx, cy) near ({width / 2:g}, {height / 2:g})")
+    expected = (f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of {width} x {height}, with the "
+                f"principal point (cx, cy) near ({width / 2:g}, {height / 2:g})")
     given = f"the intrinsics are {matrix.tolist()}"
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise ObjectError(f"{given}; {expected}")
