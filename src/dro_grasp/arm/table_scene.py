@@ -18,7 +18,7 @@ from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.perception.scan import given_points, given_pose, scanned_object
-from dro_grasp.objects.reading import numbers
+from dro_grasp.objects.reading import numbers, returned
 from dro_grasp.objects.shape import ObjectModel
 
 THICKNESS = 0.006  # Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)
@@ -83,7 +83,7 @@ def pick_object(
     wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
     if wanted is not None and wanted.shape != (len(given),):
         raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")
-    finite = np.isfinite(given).all(1)
+    finite = returned(given)
     sight = sort_out(
         given[finite], np.eye(4) if T is None else T, robot.table, near, None if wanted is None else wanted[finite])
     if len(sight.places) > 1 and near is None and mask is None:

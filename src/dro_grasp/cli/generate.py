@@ -147,6 +147,7 @@ class Generate:
         if (warning := self._warning(job, obj)) is not None:
             say_aside(f"warning: {obj.name}: {warning}")
         problem = GraspProblem(job.hand, obj, self.device, job.constraints)
+        self._cut(obj)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
         if made.shortage is not None:
@@ -187,6 +188,17 @@ class Generate:
         if not self.json:
             self._show(report, grasps, made.origin)
         return ObjectResult(report, obj, kept, points)
+
+    def _cut(self, obj: ObjectModel) -> None:
+        """Cut a mesh into convex parts, which may take most of a minute the first time; says what comes of it."""
+        if obj.is_cloud:
+            return
+        said = set(obj.notes)
+        with progress_bar(f"cutting {obj.name} into convex parts, at most [s]", self.json) as progress:
+            obj.cut(progress)
+        for note in obj.notes:
+            if note not in said:
+                say_aside(f"{obj.name}: {note}")
 
     def _say_that_none_is_left(self, name: str, output: Path | None, picture: Path | None) -> None:
         """Say what comes of it that no grasp succeeded, of all that was asked for."""

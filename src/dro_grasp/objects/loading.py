@@ -17,13 +17,20 @@ from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
-from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, read_geometry
+from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 LARGEST = 1.0  # Largest extent of an object that counts as metres [m] (ours)
 SMALLEST = 0.005  # Smallest such extent [m] (ours)
+FITTING = 0.5  # Largest extent that a hint suggests [m] (ours)
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "metres": 1.0}
+"""Units that files use [m]."""
+UNIT_OF = {".stl": "millimetres", ".3mf": "millimetres", ".off": "millimetres", ".glb": "metres", ".gltf": "metres",
+           ".dae": "metres", ".obj": "centimetres"}
+"""Units of formats, or what most programs write in them (ours); of others, metres."""
 FARTHEST = 100.0  # Largest coordinate [m] (ours): single precision rounds it by 4 micrometres
 MIN_CLOUD = 16  # Fewest distinct points of a bare cloud (ours)
+ONE_SIDED = 0.3  # Mean of the normals above which a cloud is one side of an object [1] (ours)
 NEIGHBOURS = 16  # Neighbours that estimate the normals of a bare cloud (ours)
 
 
@@ -38,7 +45,10 @@ def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> Ob
                           "`dro-grasp objects` lists")
     geometry, unit = read_geometry(path)
     if isinstance(geometry, np.ndarray):
-        return cloud_object(path.stem, geometry * unit, origin=str(path), scale=scale, keep_table=keep_table)
+        if unit != 1.0:
+            geometry[:, :3] *= unit
+        return cloud_object(path.stem, geometry, origin=str(path), scale=scale, keep_table=keep_table,
+                            named_normals=path.suffix.lower() != ".npy")
     if unit != 1.0:
         geometry.apply_scale(unit)
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
@@ -88,18 +98,18 @@ def mesh_object(
 
 def cloud_object(
     name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False,
-    seen: Float[np.ndarray, "m 3"] | None = None,
+    seen: Float[np.ndarray, "m 3"] | None = None, named_normals: bool = False,
 ) -> ObjectModel:
-    """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
+    """An object from a bare point cloud (n 3), or a cloud with normals (n 6), organised or not; only the points are scaled.
 
     `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
+    `named_normals` judges the normals that a file calls so: they are turned or estimated where they are no outward ones.
     """
+    points = in_rows(points)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "
                           "with normals")
-    bad = int((~np.isfinite(points)).any(1).sum())
-    if bad:
-        raise ObjectError(f"{origin} has {bad} points with NaN or infinite coordinates; remove them first")
+    points, dropped = _where_seen(points)
     xyz = points[:, :3] * scale
     one = distinct_points(xyz)
     merged = () if len(one) == len(points) else (f"merged {len(points) - len(one)} duplicated points",)
@@ -115,13 +125,9 @@ def cloud_object(
         raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
     cloud = np.ascontiguousarray(xyz[keep], np.float32)
-    given = points[keep, 3:]
-    length = np.linalg.norm(given, axis=1, keepdims=True)
-    has_normals = points.shape[1] == 6 and length.min() > 1e-6
-    if has_normals and not length.max() < 1.2 * length.min():  # (ours) something else, such as colours
-        raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
-                          "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
-    normals = given / length if has_normals else estimate_normals(cloud)
+    normals, odd = given_normals(cloud, points[keep, 3:], origin, named_normals)
+    has_normals = normals is not None
+    normals = normals if normals is not None else estimate_normals(cloud)
     cut = () if table is None else (table_note(table, total - len(points), total),)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
     estimated = "" if has_normals else "; normals were estimated"
@@ -129,14 +135,60 @@ def cloud_object(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
         table=table, seen=None if seen is None else seen.astype(np.float32),
-        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *merged,
-               *cut, *(() if has_normals else _one_sided(normals))))
+        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *dropped,
+               *merged, *cut, *odd, *(() if has_normals else _one_sided(normals))))
+
+
+def _where_seen(points: Num[np.ndarray, "n k"]) -> tuple[Num[np.ndarray, "m k"], tuple[str, ...]]:
+    """The points where something was seen, and how many are none."""
+    kept = returned(points[:, :3])
+    return (points, ()) if kept.all() else (points[kept], (dropped_note(int((~kept).sum()), len(kept)),))
+
+
+def dropped_note(count: int, total: int) -> str:
+    """What to say of points where nothing was seen."""
+    return f"{count} of {total} points are none (NaN, or 0 0 0 for no return) and were dropped"
+
+
+def given_normals(
+    cloud: Float[np.ndarray, "n 3"], given: Num[np.ndarray, "n k"], origin: str, named: bool
+) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
+    """Unit normals as they were given, turned if they are inward all over; None to estimate them. And what to say."""
+    if given.shape[1] != 3:
+        return None, ()
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    unit = bool(np.isfinite(length).all()) and length.min() > 1e-6 and length.max() < 1.2 * length.min()  # (ours)
+    if not unit and not named and length.min() > 1e-6:  # something else, such as colours
+        raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
+                          "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
+    if not unit and not named:
+        return None, ()
+    if not unit:
+        return None, ("its normals have not all one length, so they were not used",)
+    normals = given / length
+    if not named:
+        return normals, ()
+    if _contradict(cloud, normals):
+        return None, ("its normals point to both sides of one surface, so they were not used",)
+    # The volume that a closed cloud encloses is negative where its normals point inward. One side alone encloses none.
+    inward = float(((cloud - cloud.mean(0)) * normals).sum()) < 0 and np.linalg.norm(normals.mean(0)) <= ONE_SIDED
+    return (-normals, ("its normals pointed inward and were turned",)) if inward else (normals, ())
+
+
+def _contradict(cloud: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether many neighbours on one surface have opposite normals, as those have that no one turned outward."""
+    some = np.arange(0, len(cloud), max(1, len(cloud) // 1000))
+    distance, near = KDTree(cloud).query(cloud[some], k=min(NEIGHBOURS, len(cloud)))
+    opposite = np.einsum("nki,ni->nk", normals[near], normals[some]) < -0.5
+    # Both sides of a thin sheet have opposite normals, too, but lie above one another.
+    height = np.abs(np.einsum("nki,ni->nk", cloud[near] - cloud[some][:, None], normals[some]))
+    return float((opposite & (height < 0.2 * distance))[:, 1:].mean()) > 0.1  # (ours)
 
 
 def _one_sided(normals: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
     """A question if all points face one way, as if one camera had seen them."""
     # Over closed surfaces normals add up to nothing, over half a ball their mean is 0.5; a bowl seen from everywhere asks, too.
-    if np.linalg.norm(normals.mean(0)) <= 0.3:  # (ours)
+    if np.linalg.norm(normals.mean(0)) <= ONE_SIDED:
         return ()
     return ("its points face mostly one way, and all of them count as the whole object; if they are what one camera saw, give "
             "its pose with --camera, scanned_object in Python: the side that it did not see is then added",)
@@ -181,7 +233,7 @@ def check_scale(scale: float) -> None:
 
 
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
-    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale."""
+    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale in place of `scale`."""
     # Most files state no unit, and a wrong guess would grasp air.
     largest, farthest = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if SMALLEST <= largest <= LARGEST and farthest > FARTHEST:
@@ -191,11 +243,21 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
         return
     if largest <= 0:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
-    size, change = (f"{largest:.4g} m, too large", "--scale: 0.001 for millimetres;") if largest > LARGEST else (
-        f"{largest * 1000:.3g} mm, too small", "a larger --scale:")
-    power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give {change} "
-                      f"{scale * power:.3g} makes it {largest * power * 100:.2g} cm")
+    size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
+    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give "
+                      f"{_scale_hint(largest / scale, origin)}")
+
+
+def _scale_hint(largest: float, origin: str) -> str:
+    """Scales that make a thing that measures so much in its file [the file's unit] fit a hand, the likeliest first."""
+    own = UNIT_OF.get(Path(origin).suffix.lower(), "metres")
+    fits = [(unit, scale) for unit, scale in UNITS.items() if SMALLEST <= largest * scale <= FITTING]
+    if not fits:
+        power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
+        return f"a scale: --scale {power:.3g} makes it {largest * power * 100:.3g} cm"
+    # After the format's own unit, that comes first which makes it as large as most things that are grasped.
+    fits.sort(key=lambda fit: (fit[0] != own, abs(math.log(largest * fit[1] / 0.1))))
+    return "; ".join(f"--scale {scale:g} for {unit}, which makes it {largest * scale * 100:.3g} cm" for unit, scale in fits)
 
 
 LEAST_FILL = 1e-3

@@ -109,20 +109,62 @@ def test_a_completed_scan_knows_which_of_its_points_were_seen(
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ("millimetres", "divide millimetres by 1000"), ("mask of another size", "shape"), ("empty mask", "within the mask"),
+        ("millimetres", "divide millimetres by 1000"), ("tenths of a millimetre", "divide tenths of a millimetre by 10000"),
+        ("centimetres", "divide centimetres by 100"), ("mask of another size", "shape"), ("empty mask", "within the mask"),
         ("nothing", "no pixel"),
     ],
 )
 def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, word: str) -> None:
     image, mask = depth.copy(), None
-    if change == "millimetres":
-        image *= 1000
+    if change in (units := {"centimetres": 100, "millimetres": 1000, "tenths of a millimetre": 10000}):
+        image *= units[change]
     elif change == "nothing":
         image[:] = np.nan
     else:
         mask = np.zeros(SHAPE if change == "empty mask" else (5, 5), bool)
     with pytest.raises(ObjectError, match=word):
         depth_points(image, INTRINSICS, mask)
+
+
+BOTH = np.diag([2.0, 2.0, 1.0])
+WRONG = {
+    "transposed": (INTRINSICS.T, "is transposed: its third row holds the principal point"),
+    "without its third row": (np.array([*INTRINSICS[:2], [0, 0, 0]]), "third row is not 0 0 1"),
+    "times two": (2 * INTRINSICS, "third row is not 0 0 1"),
+    "a pose": (np.array([[300, 0, 79.5], [0.1, 310, 59.5], [0, 0, 1]]), "its second has no 0 first"),
+    "normalised": (np.diag([1 / 160, 1 / 120, 1]) @ INTRINSICS, "multiply its first row by 160 and its second by 120"),
+    "of double resolution": (BOTH @ INTRINSICS, "2 times as wide and 2 times as high: divide its first row by 2"),
+    "of half resolution": (np.linalg.inv(BOTH) @ INTRINSICS, "0.5 times as wide and 0.5 times as high"),
+    "of another camera's sides": (np.diag([3, 2.25, 1]) @ INTRINSICS, "3 times as wide and 2.2 times as high"),
+    "focal lengths below 0": (np.diag([-1, 1, 1]) @ INTRINSICS, "not positive"),
+    "of numbers": (INTRINSICS[0], "expected"), "with NaN": (np.nan * INTRINSICS, "expected"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_intrinsics_that_are_none_of_this_image_are_refused_with_what_is_expected(depth: np.ndarray, kind: str) -> None:
+    matrix, why = WRONG[kind]
+    with pytest.raises(ObjectError, match=why) as caught:
+        depth_points(depth, matrix)
+    assert "expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of 160 x 120" in str(caught.value)
+
+
+def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:
+    part = depth[10:80, 60:150]
+    matrix = INTRINSICS - np.array([[0, 0, 60.0], [0, 0, 10], [0, 0, 0]])
+    whole = depth_points(depth, INTRINSICS)
+    near = KDTree(whole).query(depth_points(part, matrix))[0]
+    assert near.max() < 1e-9
+
+
+def test_a_scan_drops_and_counts_pixels_without_a_return(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points, gaps = depth_points(depth, INTRINSICS), np.concatenate([np.zeros((500, 3)), np.full((200, 3), np.nan)])
+    clean = scanned_object("mug", points, T_object_camera)
+    dirty = scanned_object("mug", np.concatenate([points, gaps]), T_object_camera)
+    assert dirty.sha256 == clean.sha256
+    assert f"700 of {len(points) + 700} points are none (NaN, or 0 0 0 for no return) and were dropped" in dirty.notes
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, int, float, list, torch.as_tensor])

@@ -14,6 +14,7 @@ from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import grasp_file
 from dro_grasp.grasps.batch import DUPLICATE_DISTANCE, GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.cutting import CutShortError
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import read_collection
@@ -263,19 +264,18 @@ def test_a_hand_that_cannot_hold_the_object_is_told_why(tmp_path):
     assert report.grasps >= 1  # of the can
 
 
-def test_an_object_that_coacd_cannot_cut_is_told_in_one_line(tmp_path, monkeypatch):
-    import coacd
-
+def test_an_object_that_cannot_be_cut_is_told_in_one_line(tmp_path, monkeypatch):
     def fail(*args, **kwargs):
-        raise RuntimeError("assertion failed")
+        raise CutShortError("assertion failed")
 
-    monkeypatch.setattr(coacd, "run_coacd", fail)
+    monkeypatch.setattr("dro_grasp.objects.convex_parts.cut_apart", fail)
     monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path / "cache"))
     torus = trimesh.creation.torus(0.05, 0.015)
     torus.export(tmp_path / "ring.stl")
     (tmp_path / "data").mkdir()
     report, _, lines = run(tmp_path / "data", ["barrett"], [str(tmp_path / "ring.stl")], 1, make_shard, config=TINY)
-    assert "cut into convex parts (assertion failed)" in report.failures["barrett", str(tmp_path / "ring.stl")]
+    why = report.failures["barrett", str(tmp_path / "ring.stl")]
+    assert "cut into convex parts: CoACD failed (assertion failed), and V-HACD failed" in why
     assert any("ring.stl: the mesh cannot be cut" in line for line in lines)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
@@ -16,11 +16,18 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, table_note
+from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, dropped_note, estimate_normals, table_note
 from dro_grasp.objects.perception.completion import complete_cloud
-from dro_grasp.objects.reading import numbers, read_points
+from dro_grasp.objects.reading import in_rows, numbers, read_points, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
+SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
+"""Width over height of cameras' images [1] (ours)."""
+RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
+"""Widths of other images that a camera's matrix may be of, over that of the given one [1] (ours)."""
+DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
+"""Units of depth images [m], the largest first."""
+FAR_DEPTH = 2.0  # Largest median depth of an image of things to grasp [m] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
 
@@ -38,9 +45,9 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
         ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
     image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
-    if image.ndim != 2 or matrix.shape != (3, 3) or not abs(float(np.linalg.det(matrix))) > 0:
-        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), "
-                          "and a 3x3 matrix with focal lengths and principal point in pixels")
+    if image.ndim != 2:
+        raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
+    _check_intrinsics(matrix, *image.shape)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
@@ -51,12 +58,55 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    if float(np.median(image[valid])) > 10.0:  # [m] (ours)
-        raise ObjectError(f"the median depth is {np.median(image[valid]):g}, too far for metres; divide millimetres by 1000")
+    _check_depths(float(np.median(image[valid])))
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
     rays = np.linalg.solve(matrix.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
+
+
+def _check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int) -> None:
+    """Refuse a matrix that is no pinhole camera's, or that of an image of another size, by an ObjectError."""
+    expected = (f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of {width} x {height}, with the "
+                f"principal point (cx, cy) near ({width / 2:g}, {height / 2:g})")
+    given = f"the intrinsics are {matrix.tolist()}"
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ObjectError(f"{given}; {expected}")
+    if (matrix[:2, 2] == 0).all() and (matrix[2, :2] != 0).any():
+        raise ObjectError(f"{given}, which is transposed: its third row holds the principal point; {expected}")
+    if not np.allclose(matrix[2], [0, 0, 1]) or abs(matrix[1, 0]) > 1e-6 * abs(matrix[1, 1]):
+        raise ObjectError(f"{given}, which is no pinhole matrix: its third row is not 0 0 1, or its second has no 0 first; "
+                          f"{expected}")
+    (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+    if min(fx, fy) <= 0:
+        raise ObjectError(f"{given}: its focal lengths are not positive; {expected}")
+    if max(fx, fy) < 10 and max(abs(cx), abs(cy)) <= 1.5:  # (ours) no lens sees so wide
+        raise ObjectError(f"{given}, which is divided by the size of the image: multiply its first row by {width} and its "
+                          f"second by {height}; {expected}")
+    _check_resolution(matrix, height, width, given, expected)
+
+
+def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int, given: str, expected: str) -> None:
+    # A part of an image has its principal point anywhere, and rarely the sides of a whole one.
+    if not any(abs(width / height / sides - 1) < 0.01 for sides in SIDES):
+        return
+    across, down = (2 * (float(c) + 0.5) / side for c, side in zip(matrix[:2, 2], (width, height), strict=True))
+    other = any(abs(across / factor - 1) < 0.08 for factor in RESOLUTIONS)
+    if other and down > 0 and any(abs(across / down / sides - 1) < 0.08 for sides in (1.0, 4 / 3, 3 / 4)):
+        raise ObjectError(f"{given}, which is of an image {across:.2g} times as wide and {down:.2g} times as high: divide its "
+                          f"first row by {across:.2g} and its second by {down:.2g}, or give the image that it belongs to; "
+                          f"{expected}")
+
+
+def _check_depths(median: float) -> None:
+    """Refuse depths whose median is too far for metres, by an ObjectError that names their likely unit."""
+    if median <= 10.0:  # [m] (ours)
+        return
+    unit, most = next(((unit, 1 / size) for unit, size in DEPTH_UNITS.items() if median * size <= FAR_DEPTH), ("pixels", 0.0))
+    if not most:
+        raise ObjectError(f"the median depth is {median:g}, too far for any unit; give depths along z in metres")
+    raise ObjectError(f"the median depth is {median:g}, too far for metres; in {unit} it is {median / most:.3g} m: "
+                      f"divide {unit} by {most:g}")
 
 
 def load_scan(
@@ -78,7 +128,7 @@ def scanned_object(
 
     Args:
         name: What to call the object.
-        points: Points in the camera's frame, (n, 3) [m].
+        points: Points in the camera's frame, (n, 3) or (h, w, 3) [m]; NaN and (0, 0, 0) are dropped.
         T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
             `table` are given; the camera's own frame by default.
         denoise: Drop outliers.
@@ -92,7 +142,9 @@ def scanned_object(
     """
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
     kept = given_points(points, name)
-    kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
+    there, camera = returned(kept), np.zeros(3)
+    dropped = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
+    kept = kept[there]
     kept = kept[distinct_points(kept)]
     total, table = len(kept), None if keep_table else table_plane(kept, camera)
     if table is not None:
@@ -119,12 +171,13 @@ def scanned_object(
         table = None if table is None else moved_plane(table, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
-    return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
+    cut_off = () if table is None else (table_note(table, cut, total),)
+    return replace(obj, table=table, notes=(*obj.notes, *dropped, *cut_off))
 
 
 def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
     """The points of a cloud, NaN included [m]; an ObjectError if they are none."""
-    array = numbers(points, origin).astype(np.float64)
+    array = in_rows(numbers(points, origin).astype(np.float64))
     if array.ndim != 2 or array.shape[1] != 3:
         raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
     return array
