@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import secrets
 import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -21,7 +20,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
-from dro_grasp.apps.origins import own_names, refusal
+from dro_grasp.apps.origins import LOCAL, own_names, refusal, same_token
 from dro_grasp.apps.server.connections import Limits, within
 from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
@@ -41,7 +40,7 @@ class Access:
     body_seconds: float = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 
     def __post_init__(self) -> None:
-        if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
+        if self.host not in LOCAL and not self.token:
             raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
                               "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
         if not 0 < self.megabytes <= 1000:
@@ -68,8 +67,8 @@ class Gate:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         scheme, _, borne = headers.get("Authorization", "").partition(" ")
-        same = secrets.compare_digest(borne.strip().encode(), (self.access.token or "").encode())
-        if self.access.token and path != "/health" and not (same and scheme.lower() == "bearer"):
+        known = scheme.lower() == "bearer" and same_token(borne.strip(), self.access.token or "")
+        if self.access.token and path != "/health" and not known:
             return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
                                                     "header 'Authorization: Bearer TOKEN'")
         length = headers.get("Content-Length", "0")
