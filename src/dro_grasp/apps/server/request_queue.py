@@ -44,6 +44,7 @@ LATE_SECONDS = 3.0  # How much later than it was told a refused request may come
 USUAL_SECONDS = 2.0  # Computing time of a request, before any is known [s] (ours)
 STOP_SECONDS = 1.0  # How long a process that was terminated waits to hear whether the server stops [s] (ours)
 STOPPED = refused(HTTPStatus.SERVICE_UNAVAILABLE, "the server is stopping; ask another one, or ask again once it runs")
+"""The reply to a request that a stopping server does not answer any more."""
 CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")  # The reply to a request that is no longer wanted
 
 
