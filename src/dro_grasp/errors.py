@@ -57,3 +57,8 @@ class TrainingError(DroGraspError):
 
 class ServerError(DroGraspError):
     """A grasp server refuses a request, fails, or is not there."""
+
+    def __init__(self, message: str, retry_after: float | None = None) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
+        """When it is worth while to ask again [s]; None where that is not known."""

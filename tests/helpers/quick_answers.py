@@ -32,7 +32,7 @@ class QuickAnswerer:
         return ["can"]
 
     def answer(self, call: Any, progress: Callable[[int, int], None]) -> Any:
-        """`echo`, `die`, `sleep` until it is cancelled, or `hang` whatever is said."""
+        """`echo`, `die`, `nap` for half a second, `sleep` until it is cancelled, or `hang` whatever is said."""
         if call.hand == "die":
             os._exit(7)
         if call.hand == "wrong":
@@ -41,6 +41,8 @@ class QuickAnswerer:
             raise ZeroDivisionError
         if call.hand == "hang":
             time.sleep(60)
+        if call.hand == "nap":
+            time.sleep(0.5)
         while call.hand == "sleep":
             progress(0, 1)
             time.sleep(0.01)

@@ -20,7 +20,10 @@ Arrays = dict[str, Num[np.ndarray, "..."]]  # Arrays by name, as in an NPZ file
 def cache_folder() -> Path:
     """The folder of derived geometry: `DRO_GRASP_CACHE`, or the user's cache folder."""
     root = os.environ.get("DRO_GRASP_CACHE")
-    return given_path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
+    if root:
+        return given_path(root)
+    stated = Path(os.environ.get("XDG_CACHE_HOME", ""))  # by its specification an empty or relative one does not count
+    return (stated if stated.is_absolute() else Path.home() / ".cache") / "dro-grasp"
 
 
 def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:

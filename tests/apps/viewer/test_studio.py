@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -21,7 +25,7 @@ from dro_grasp.apps.viewer.grasp_page import EXPORTS, GraspViewer, chosen, expor
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.cli.view import View
-from dro_grasp.errors import HandError
+from dro_grasp.errors import HandError, OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
@@ -379,3 +383,30 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
         page.screenshot(path=tmp_path / "page.png", timeout=300_000)
     assert len(GraspBatch.load(saved)) == 16
     assert (tmp_path / "page.png").stat().st_size > 20_000
+
+
+def test_sigterm_removes_what_was_uploaded(tmp_path: Path) -> None:
+    code = ("import sys; from dro_grasp.apps.library import Library; from dro_grasp.apps.viewer.scene_view import serve\n"
+            "from types import SimpleNamespace; import time\n"
+            "library = Library(); library.take('a.stl', b'solid', 'object')\n"
+            "server = SimpleNamespace(sleep_forever=lambda: time.sleep(60))\n"
+            "serve(SimpleNamespace(url='here', server=server, stop=library.close))\n")
+    for sign in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True,
+                              env={**os.environ, "TMPDIR": str(tmp_path)}) as process:
+            assert process.stderr is not None
+            assert "viewer: here" in process.stderr.readline()
+            assert list(tmp_path.glob("dro-grasp-*/1/a.stl"))
+            time.sleep(0.3)
+            process.send_signal(sign)
+            assert process.wait(20) == 0
+            assert process.stderr.read() == ""
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_no_list_offers_is_no_path(studio: Studio, tmp_path: Path) -> None:
+    file = tmp_path / "secret.stl"
+    trimesh.creation.box([0.05] * 3).export(file)
+    for kind in ("hand", "object", "scene"):
+        with pytest.raises(OptionError, match=f"no {kind} is called '{file}' here"):
+            studio.library._of_name(kind, str(file), lambda name: pytest.fail(f"{name} is read"))

@@ -252,9 +252,12 @@ class StudioServer(ServedPage):
         >>> server = StudioServer(lambda client, turn: Studio(client, predictor, turn=turn))
     """
 
-    def __init__(self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
+    def __init__(
+        self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST,
+        token: str | None = None,
+    ) -> None:
         """Start serving; `make` makes the page of a browser, with a lock that is the same for all."""
-        super().__init__(port, host)
+        super().__init__(port, host, token)
         self._make, self._turn = make, threading.Lock()
         self.studios: dict[int, Studio] = {}
         """Pages that are open, by the browser's number."""
