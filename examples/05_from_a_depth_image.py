@@ -21,9 +21,9 @@ in_base = dro.visible_points(duck, direction, torch.Generator().manual_seed(0), 
 points = (in_base - T_base_camera[:3, 3]) @ T_base_camera[:3, :3]
 obj = dro.scanned_object("seen", points, T_base_camera)
 
-table = float(obj.cloud[:, 2].min())
+table = float(duck.cloud[:, 2].min())  # The robot knows the height of the table that it is mounted on.
 grasps = dro.GraspPredictor().predict(dro.load_hand("allegro"), obj, num=8, direction=(0.0, 0.0, -1.0), table=table)
 print(f"{obj.notes[0]}")
-for i in range(3):
-    x, y, z = grasps.T_object_wrist[i, :3, 3].tolist()
-    print(f"grasp {i}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base frame, score {float(grasps.score[i]):.2f}")
+for place, score in zip(grasps.T_object_wrist[:3, :3, 3].tolist(), grasps.score.tolist(), strict=False):
+    x, y, z = place
+    print(f"wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base frame, score {score:.2f}")

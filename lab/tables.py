@@ -250,8 +250,9 @@ def sides(results: Results) -> str:
     lines = []
     for (hand, side), own in found.items():
         asked, held = sum(r["asked"] for r in own), sum(r["held"] for r in own)
+        lowest = [r["clearance"] for r in own if r["clearance"] is not None]  # none where nothing was returned
         lines.append([f"{hand}, {side}", asked, sum(r["returned"] for r in own), of(held, asked),
-                      f"{1e3 * min(r['clearance'] for r in own):.1f}", f"{sorted(r['cpu'] for r in own)[len(own) // 2]:.1f}"])
+                      f"{1e3 * min(lowest):.1f}" if lowest else "-", f"{sorted(r['cpu'] for r in own)[len(own) // 2]:.1f}"])
     return table(["", "asked", "returned", "`carry` [%]", "least clearance [mm]", "median CPU [s]"], lines)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -157,7 +157,7 @@ def test_a_stated_mass_is_lifted_and_planned_for(
     monkeypatch.setattr(tabletop, "plan", unplanned)
     for mass in (0.4, None):
         config = replace(QUICK, see=see, mass=mass, clutter=1)
-        made = attempt(robot, can, 0, 0, cast(dro.GraspPredictor, None), config)
+        made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)
         assert made.reason == "not planned"
         bodies = [scenes[-1].model.body(object_name(i)).mass[0] for i in range(2)]
         assert bodies == pytest.approx([mass or can.mass, other_objects("can", 1, np.random.default_rng([0, 0, 1]))[0].mass])

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import nnls
 
 from dro_grasp.geometry.contact_forces import friction_cone
 from dro_grasp.grasps.batch import GraspBatch
@@ -210,3 +211,21 @@ def test_squeezes_stay_within_efforts(hand: Hand, obj: ObjectModel) -> None:
     added = (wanted[0, 1] - (chosen.base - chosen.joints)[0] * 3.0) / chosen.torques[0]
     free = targets[0, 1] < hand.tree.upper - 1e-6
     assert math.isclose(float(added[free].min()), float(added[free].max()), rel_tol=1e-3), "all torques shrink alike"
+
+
+def test_large_programs_are_solved_with_any_number_of_threads() -> None:
+    """Twenty contacts have 160 unknowns, for which some batched LU fails with two threads. SciPy says the answer."""
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(6, 160, 160, generator=generator) / 160**0.5
+    hessian = factor @ factor.mT + torch.eye(160)
+    slope = torch.randn(6, 160, 2, generator=generator)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        found = module._least_energy(hessian, slope, PayloadConfig(iterations=400))
+    finally:
+        torch.set_num_threads(threads)
+    for k, c in ((0, 0), (5, 1)):
+        root = np.linalg.cholesky(hessian[k].double().numpy())
+        expected, _ = nnls(root.T, np.linalg.solve(root, slope[k, :, c].double().numpy()))
+        np.testing.assert_allclose(found[k, :, c], expected, atol=2e-3)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import Delaunay
 
+from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import TABLE
@@ -17,7 +19,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.rollout import Rollout, lowest_points, rollouts
+from dro_grasp.simulation.rollout import Rollout, lowest_points, rollouts, stands
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import simulate
 
@@ -144,3 +146,39 @@ def test_lowest_points() -> None:
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     assert obj.vertices is not None
     assert np.allclose(lowest_points(obj, up), [min(float(u @ v) for v in obj.vertices) for u in up])
+
+
+def made_of_balls(centres: np.ndarray, centre_of_mass: np.ndarray) -> ObjectModel:
+    balls = Balls(torch.from_numpy(centres).float(), torch.full((len(centres),), 0.004))
+    return replace(block((0.02, 0.05, 0.02)), balls=balls, centre_of_mass=centre_of_mass)
+
+
+def test_an_estimate_stands_where_its_centre_of_mass_is_above_what_carries_it() -> None:
+    rng, T = np.random.default_rng(0), motion()
+    found, true = [], []
+    for _ in range(60):
+        feet = np.concatenate([rng.uniform(-0.03, 0.03, (4, 2)), np.zeros((4, 1))], 1)
+        middle = np.append(rng.uniform(-0.02, 0.02, 2), 0.02)
+        centres = np.concatenate([feet, rng.uniform([-0.05, -0.05, 0.01], 0.05, (9, 3))])
+        obj = made_of_balls(centres @ T[:3, :3].T + T[:3, 3], T[:3, :3] @ middle + T[:3, 3])
+        found.append(bool(stands(obj, T[None, :3, 2])[0]))
+        true.append(bool(Delaunay(feet[:, :2]).find_simplex(middle[:2]) >= 0))
+    assert 10 < sum(true) < 50  # of 60
+    assert found == true
+
+
+def test_an_estimate_that_would_fall_over_stays_where_it_was_seen(jaws: Hand) -> None:
+    """One of its points is too low: the weight does not act on it. A cloud that stands is pressed on the table."""
+    corners = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.02, 0.02) for z in (0.004, 0.03)])
+    middle = np.array([0.0, 0.0, 0.017])
+    low = np.append(corners, [[0.01, 0.02, -0.006]], 0)
+    shifts, forces = [], []
+    for centres, level in ((corners, 0.0), (low, -0.01)):
+        obj = made_of_balls(centres, middle)
+        grasp = pinch(jaws, obj, 0.06, 0.02).replace(extra={TABLE: torch.tensor([[0.0, 0.0, 1.0, level]])})
+        (_, rollout), = rollouts(scene_of(jaws, obj, grasp, "carry"), jaws, grasp, workers=1)
+        forces.append(float(np.abs(rollout.force).max()))
+        shifts.append(rollout.close().shift(rollout.start)[0])
+    assert forces[0] > 0
+    assert forces[1] == 0
+    assert max(shifts) < 1e-3

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -75,6 +75,7 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     return grasps.with_poses(T, q)
 
 
+@runtime_checkable
 class Slope(Protocol):
     """What a descent needs of an energy."""
 

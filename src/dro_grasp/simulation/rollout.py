@@ -30,6 +30,8 @@ from dro_grasp.simulation.scene import TABLE_AWAY, TrialScene, object_mass
 
 FACTORS = ("friction", "mass", "gain")  # Conditions that are factors, as in Perturbations
 
+Moment = dict[str, Float[np.ndarray, "n _"]]  # What it takes to go on from a moment, in each of n trials
+
 RESOLUTION = 1e-4  # Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise
 
 
@@ -181,19 +183,18 @@ class Rollout:
         self.force[:, self.scene.object_body, :3] = np.einsum("nij,nj->ni", self.start.rotation, force)
         return self.press(targets, seconds)
 
-    def moment(self) -> dict[str, Float[np.ndarray, "n k"]]:
+    def moment(self) -> Moment:
         """What it takes to go on from here later; see `go_back`."""
         return {name: np.array(self.batch.bind(name)) for name in STATE}
 
-    def go_back(self, moment: dict[str, Float[np.ndarray, "n k"]]) -> None:
+    def go_back(self, moment: Moment) -> None:
         """Return all trials to an earlier moment, without forces."""
         self.force[:] = 0
         for name, values in moment.items():
             self.batch.bind(name)[:] = values
 
     def pull(
-        self, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], seconds: float,
-        begin: dict[str, Float[np.ndarray, "n m"]] | None = None,
+        self, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], seconds: float, begin: Moment | None = None
     ) -> ObjectState:
         """Let a force on each object, as of `load`, act in some of the trials for a time [s], from a moment if one is given."""
         for name, values in (begin or {}).items():
@@ -278,7 +279,8 @@ class Rollout:
             mujoco.mju_quatZ2Vec(quaternion, direction)
         self.batch.bind("mocap_pos")[laid, 0] = height[:, None] * normal
         self.batch.bind("mocap_quat")[laid, 0] = turned
-        weight = GRAVITY * self.mass[laid] * (lowest - level < RESTS)
+        rests = (lowest - level < RESTS) & stands(self.scene.obj, up)
+        weight = GRAVITY * self.mass[laid] * rests
         self.force[laid, self.scene.object_body, :3] = -weight[:, None] * normal
 
     def _change(self, conditions: Conditions) -> None:
@@ -314,6 +316,25 @@ def lowest_points(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Float[np.nd
     if obj.balls is not None:
         return (up @ obj.balls.centres.double().numpy().T - obj.balls.radii.double().numpy()).min(1)
     return (up @ np.concatenate([vertices for vertices, _ in obj.parts]).T).min(1)
+
+
+def stands(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether an estimated object stands on its lowest points, for each upward direction; what is known may fall over.
+
+    A camera sees things at rest. Where the estimate of one has its lowest points to one side, that is an error of the estimate.
+    """
+    if obj.balls is None:
+        return np.ones(len(up), bool)
+    centres, radii = obj.balls.centres.double().numpy(), obj.balls.radii.double().numpy()
+    heights = up @ centres.T - radii
+    low = heights < heights.min(1, keepdims=True) + RESTS
+    # The centre of mass is above the hull of what carries it if no half of the directions around it is empty.
+    across = np.linalg.svd(up[:, None])[2][:, 1:]
+    x, y = np.einsum("nsk,bk->snb", across, centres - obj.centre_of_mass)
+    angles = np.where(low, np.arctan2(y, x), np.nan)
+    angles = np.sort(np.where(low, angles, np.nanmax(angles, 1, keepdims=True)), 1)
+    gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * math.pi)
+    return gaps.max(1) < math.pi
 
 
 def rollouts(

@@ -23,10 +23,9 @@ from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.payload import GRAVITY, Squeezes
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.rollout import Rollout, rollouts
+from dro_grasp.simulation.rollout import Moment, Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 
-Moment = dict[str, Float[np.ndarray, "n k"]]  # As of `Rollout.moment`
 LESS = 0.95  # Share of a mass that gave way, which its grasp may still carry (ours)
 NOT_HELD = 1e3  # Share of what an object may move that one has used whose simulation is unsound (ours)
 

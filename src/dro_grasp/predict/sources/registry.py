@@ -84,7 +84,7 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
                       "of your own as module:Class, or give a grasp file (.parquet)")
 
 
-def _made(name: str, factory: Callable[[], Any]) -> Any:
+def _made(name: str, factory: Any) -> Any:
     """What a factory makes.
 
     Raises:
@@ -108,7 +108,7 @@ def _as_source(name: str, made: Any) -> Source:
     return made
 
 
-def _own_class(module: str, attribute: str) -> Callable[[], Any]:
+def _own_class(module: str, attribute: str) -> Any:
     """A class by its module and name; modules in the working directory are found too."""
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
