@@ -49,9 +49,9 @@ def simulate(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.
     """
+    scene = scene_of(hand, obj, grasps, protocol)
     if not another:
         grasps.require_object(obj)
-    scene = scene_of(hand, obj, grasps, protocol)
     results, done = [], 0
     for part, rollout in rollouts(scene, hand, grasps, workers):
         penetration = measure_penetration(scene, part)
