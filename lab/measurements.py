@@ -30,6 +30,7 @@ MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
 """Built-in arms with hands."""
+SEEN_IN_PART = "seen in part"  # End of the names of cells of one depth image
 FAST, ALL = "carry dexgraspbench strict", "carry robust dexgraspbench strict"
 """Protocols: those of one trial a grasp, and with the one of eight. Beside the paper stands its own as well: `dro`."""
 CORE = ("devices.py", "frames.py", "kinds.py", "geometry", "network", "objects", "hands", "distance_matrix.py", "grasps",
@@ -93,8 +94,11 @@ def _unseen() -> dict[str, str]:
 
 def _confidence() -> dict[str, str]:
     groups = {_short(hand): f"--hands {hand}" for hand in (*PAPER_HANDS, *UNSEEN_HANDS)} | {"made": f"--made {MADE_HANDS}"}
-    return {f"{group}, {name}": f"python -m lab.studies.confidence {hands} --objects {objects} --num 8 --json"
-            for group, hands in groups.items() for name, objects in (("test", OBJECTS["test"]), ("hard", "builtin:hard_test"))}
+    whole = {f"{group}, {name}": f"python -m lab.studies.confidence {hands} --objects {objects} --num 8 --json"
+             for group, hands in groups.items() for name, objects in (("test", OBJECTS["test"]), ("hard", "builtin:hard_test"))}
+    return whole | {
+        f"{_short(hand)}, {SEEN_IN_PART}": f"python -m lab.studies.confidence --hands {hand} --objects {OBJECTS['test']} "
+        "--view depth --num 8 --json" for hand in PAPER_HANDS}
 
 
 MEASUREMENTS = {

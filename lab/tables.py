@@ -23,7 +23,7 @@ from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import ALL, Row, average
 from lab import pages
 from lab.benchmarks.report import ROOT
-from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS
+from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART
 from lab.runner import RESULTS
 from lab.studies import payload
 
@@ -270,16 +270,26 @@ def flat(results: Results) -> str:
 
 
 def confidence(results: Results) -> str:
-    """Predicted beside observed, in ten bins, of hands that no weights were trained on."""
+    """Predicted beside observed, in ten bins: of hands that no weights were trained on, and of objects seen in part."""
+    cells = results.cells("confidence")
+    unseen = [cell for name, cell in cells.items() if not name.startswith(tuple(map(plain, PAPER_HANDS)))]
+    in_part = [cell for name, cell in cells.items() if name.endswith(SEEN_IN_PART)]
     lines = []
     for k in range(10):
-        own = [b for name, cell in results.cells("confidence").items() if not name.startswith(tuple(map(plain, PAPER_HANDS)))
-               for b in cell["bins"] if round(10 * b["from"]) == k]
-        n = sum(b["n"] for b in own)
-        if n:
-            predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
-            lines.append([f"{10 * k} to {10 * k + 10}", n, f"{100 * predicted / n:.0f}", of(round(held), n)])
-    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]"], lines)
+        both = [_reliability(group, k) for group in (unseen, in_part)]
+        if any(map(any, both)):
+            lines.append([f"{10 * k} to {10 * k + 10}", *both[0], *both[1]])
+    of_part = ("seen in part", "predicted [%]", "held [%]")
+    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]", *of_part], lines)
+
+
+def _reliability(cells: Sequence[Any], k: int) -> tuple[Any, str, str]:
+    """Grasps of a bin, what was predicted of them, and how many held; empty words for none."""
+    own = [b for cell in cells for b in cell["bins"] if round(10 * b["from"]) == k]
+    if not (n := sum(b["n"] for b in own)):
+        return "", "", ""
+    predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
+    return n, f"{100 * predicted / n:.0f}", of(round(held), n)
 
 
 def methods(results: Results) -> str:

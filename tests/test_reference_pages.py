@@ -172,7 +172,7 @@ def test_the_page_of_the_method_has_the_numbers_of_the_code() -> None:
         f"each cube of {BALL_SPACING * mm:g} mm",
         f"at most {BALL_OUTSIDE * mm:g} mm through the surface",
         f"at least {easing.clearance * mm:g} mm and at most {easing.unseen * mm:g} mm",
-        f"falls by {settle.clearance_worth:g} log-odds per metre",
+        f"becomes {settle.guess_offset:g} + {settle.guess_worth:g} s, less {settle.clearance_worth:g} log-odds per metre",
         f"F = m {PUSH:g} m/s^2",
         f"|sum f_k + F|^2 / (m {UNIT:g} m/s^2)^2",
         f"(m {UNIT:g} m/s^2 {LEVER * 1e2:g} cm)^2 + {CHANGE:g}^2 sum (x_k - 1)^2",

@@ -66,7 +66,7 @@ def predictions(device: str, weights: dict[str, str], repetitions: int) -> list[
             parts: list[dict[str, float]] = []
 
             def run(predictor: GraspPredictor = predictor, num: int = num, parts: list[dict[str, float]] = parts) -> None:
-                request = GraspRequest(num, len(parts), candidates=1, source="network")
+                request = GraspRequest(num, len(parts), candidates=1, source="network", least_confidence=0.0)
                 parts.append(dict(predictor.run(GraspProblem(hand, obj, device), request).seconds))
 
             whole = median(run, repetitions)

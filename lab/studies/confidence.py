@@ -3,7 +3,7 @@
 All that `generate` returns with a least confidence of 0 is tried under `carry`, which the confidence is about. It also tells
 what each least confidence costs of the grasps that hold, and drops of those that fail. Nothing is chosen here.
 
-    python -m lab.studies.confidence [--hands HAND ...] [--made 10] [--objects OBJECT ...] [--num 8] [--json]
+    python -m lab.studies.confidence [--hands HAND ...] [--made 10] [--objects OBJECT ...] [--view whole] [--num 8] [--json]
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import tempfile
 from itertools import product
 from pathlib import Path
+from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,6 +24,7 @@ from dro_grasp.compare.stages import pair_seed
 from dro_grasp.errors import NoGraspError
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
@@ -45,12 +47,13 @@ def hands_of(names: list[str], made: int, folder: Path) -> list[str]:
 
 
 def returned(
-    predictor: GraspPredictor, hand_name: str, object_name: str, num: int, protocol: str
+    predictor: GraspPredictor, hand_name: str, object_name: str, view: View, num: int, protocol: str
 ) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Confidences of all grasps that are returned for a pair, and whether they hold."""
+    """Confidences of all grasps that are returned for a pair, and whether they hold the whole object."""
     hand, obj = load_hand(hand_name), load_object(object_name)
+    seed = pair_seed(0, hand, obj)
     try:
-        made = predictor.run(GraspProblem(hand, obj), GraspRequest(num, pair_seed(0, hand, obj), least_confidence=0.0))
+        made = predictor.run(GraspProblem(hand, partial_view(obj, view, seed)), GraspRequest(num, seed, least_confidence=0.0))
     except NoGraspError:
         return torch.zeros(0), torch.zeros(0, dtype=torch.bool)
     return made.grasps.confidence, simulate(hand, obj, made.grasps, protocol).success
@@ -62,6 +65,7 @@ def main() -> None:
     parser.add_argument("--hands", nargs="*", default=[], help="names or files of hands")
     parser.add_argument("--made", type=int, default=0, help="made-up hands beside them")
     parser.add_argument("--objects", nargs="+", default=["builtin:hard_train"], help="names, files or groups of objects")
+    parser.add_argument("--view", choices=get_args(View), default="whole", help="what is seen of the objects")
     parser.add_argument("--num", type=int, default=8, help="grasps of each pair")
     parser.add_argument("--protocol", default="carry", help="trial")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -71,13 +75,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, progress_bar("pairs", options.json) as progress:
         hands = hands_of(options.hands, options.made, Path(folder))
         for hand, obj in product(hands, objects):
-            pairs.append(returned(predictor, hand, obj, options.num, options.protocol))
+            pairs.append(returned(predictor, hand, obj, options.view, options.num, options.protocol))
             if progress is not None:
                 progress(len(pairs), len(hands) * len(objects))
     confidence, held = (torch.cat(column) for column in zip(*pairs, strict=True))
     bins = reliability(confidence, held)
     facts = {
-        "hands": [Path(hand).stem for hand in hands], "objects": objects, "protocol": options.protocol,
+        "hands": [Path(hand).stem for hand in hands], "objects": objects, "view": options.view, "protocol": options.protocol,
         "asked": options.num * len(pairs), "returned": len(held), "held": int(held.sum()),
         "area": roc_area(confidence.float(), held), "bins": bins,
         "least": [price_of_least(confidence, held, least) for least in LEVELS]}

@@ -9,6 +9,7 @@ each grasp counts for its nearest half-axis; uniform is 16.7 %. Needs the develo
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -23,6 +24,8 @@ from dro_grasp.predict.predictor import GraspPredictor
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS
 
+ALONE: dict[str, Any] = {"candidates": 1, "source": "network", "least_confidence": 0.0}
+"""What the network predicts, with nothing chosen among it or left out."""
 KEPT = 20.0
 """Angle within which a direction counts as kept [degrees]."""
 
@@ -49,10 +52,10 @@ def main() -> None:
     for name in HANDS:
         hand = load_hand(name)
         asked = torch.cat([
-            palm_angles(hand, predictor.predict(hand, obj, options.num, direction=axis, candidates=1, source="network"), axis)
+            palm_angles(hand, predictor.predict(hand, obj, options.num, direction=axis, **ALONE), axis)
             for obj in objects for axis in axes]).rad2deg()
         free = torch.cat([
-            hand.palm_directions(predictor.predict(hand, obj, 6 * options.num, candidates=1, source="network").T_object_wrist)
+            hand.palm_directions(predictor.predict(hand, obj, 6 * options.num, **ALONE).T_object_wrist)
             for obj in objects])
         shares = 100 * torch.bincount(half_axis(free), minlength=6) / len(free)
         rows.append([name, len(asked), float(asked.median()), float(asked.quantile(0.95)),

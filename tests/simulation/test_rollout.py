@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.simulation.rollout import ObjectState, _matrices, quiet
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.simulation import scene
+from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.rollout import ObjectState, _matrices, quiet, rollouts
 
 ROTATIONS = Rotation.random(200, random_state=0)
 
@@ -59,3 +66,22 @@ def test_warnings_of_the_simulator_are_kept_quiet_and_heard_again_afterwards() -
         assert heard
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def test_a_simulation_with_more_contacts_than_fit_into_memory_is_unsound_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as a hand deep in the balls of a cloud."""
+    hand, can = load_hand("allegro"), load_object("can")
+    away, inside = torch.eye(4), torch.eye(4)
+    away[2, 3] = 1.0
+    grasps = GraspBatch.create(hand, can, torch.stack([away, inside]), hand.canonical_joints(1.0).expand(2, -1))
+    states = []
+    for memory in (scene.MEMORY, 1 << 17):
+        monkeypatch.setattr(scene, "MEMORY", memory)
+        built = scene.build_scene(hand, can, PROTOCOLS["carry"])
+        (_, rollout), = rollouts(built, hand, grasps, workers=1)
+        states.append(rollout.close())
+    assert states[0].stable.tolist() == [True, True]
+    assert states[1].stable.tolist() == [True, False]
+    np.testing.assert_array_equal(states[0].position[0], states[1].position[0])

@@ -23,7 +23,7 @@ from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
-from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
+from dro_grasp.simulation.scene import HULL_VERTICES, MEMORY, PREFIX, attach, hand_spec, joint_addresses, let_touch
 
 ARM = "arm/"  # Prefix of the arm's names
 WORLD = "world"  # MuJoCo's name of the body that the table is of
@@ -313,6 +313,7 @@ def _set_bits(scene: mujoco.MjSpec, fingers: bool = False) -> None:
 def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.MjSpec:
     """Arm, hand and table; nothing drives them yet."""
     scene = mujoco.MjSpec()
+    scene.memory = MEMORY
     option = scene.option
     option.timestep, option.impratio, option.noslip_iterations = protocol.timestep, protocol.impratio, protocol.noslip
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC

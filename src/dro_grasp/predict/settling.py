@@ -55,8 +55,12 @@ class SettleConfig(Checked):
 
     share: float = 0.5
     """Share of scored candidates that are settled, the best ones; the others are left out."""
-    clearance_worth: float = 80.0
+    clearance_worth: float = 90.0
     """What the score of a grasp on an object seen in part loses for clearance that the opened hand lacks [log-odds per m]."""
+    guess_offset: float = -2.8
+    """What it loses because part of the object is a guess [log-odds]; as the other two from lab/studies/seen_score.py."""
+    guess_worth: float = 0.6
+    """What a unit of the score is worth there."""
     still: float = 0.005
     """A grasp that moves the object less than this has settled; others are refined where they stand, and close again [m]."""
     lost: float = 0.05
@@ -142,7 +146,8 @@ def settle_best(
     found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
-        found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
+        lacking = missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
+        found = config.guess_offset + config.guess_worth * found - config.clearance_worth * lacking
     return SettledBest(best, closed.replace(score=found), doubts(known, wrong, jammed, config))
 
 

@@ -145,6 +145,7 @@ class Rollout:
         self.batch = mujoco.batch.Batch(scene.model, nsim=self.size, nthread=min(workers, self.size))
         if conditions is not None:
             self._change(conditions)
+        self.overflowed = np.zeros(self.size, bool)
         self.qpos, self.ctrl, self.force = (self.batch.bind(n) for n in ("qpos", "ctrl", "xfrc_applied"))
         self.qpos[:] = scene.qpos(grasps.T_object_wrist, start)
         postures = [start, grasps.joints, target] if rules.gradual else [target]
@@ -246,7 +247,7 @@ class Rollout:
         pose = self.qpos[rows][:, self.scene.object_qpos]
         rotation = _matrices(pose[:, 3:])
         # MuJoCo resets a trial that explodes and continues; only the warning tells.
-        unstable = self.batch.warning[rows][:, :, 1].any(1) | ~np.isfinite(self.qpos[rows]).all(1)
+        unstable = self.batch.warning[rows][:, :, 1].any(1) | ~np.isfinite(self.qpos[rows]).all(1) | self.overflowed[rows]
         return ObjectState(pose[:, :3], rotation, ~unstable)
 
     def poses(self) -> tuple[Float[np.ndarray, "n n_dof"], Float[np.ndarray, "n 4 4"]]:
@@ -306,7 +307,10 @@ class Rollout:
         stride = steps if self.stride is None else self.stride
         with quiet():
             for done in range(0, steps, max(1, stride)):
-                self.batch.step(rows.tolist(), nstep=min(stride, steps - done))
+                try:
+                    self.batch.step(rows[~self.overflowed[rows]].tolist(), nstep=min(stride, steps - done))
+                except mujoco.batch.SimulationError as error:  # more contacts than fit into memory; the others went on
+                    self.overflowed[error.ids] = True
                 if self.stride is not None:
                     self.frames.append(self.poses())
 

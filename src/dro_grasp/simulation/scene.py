@@ -133,6 +133,7 @@ def servo_joints(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k
 SOLVER_ITERATIONS = 20
 """Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
 FAR_AWAY = (0.0, 0.0, 5.0)  # Place of the object until a grasp is written [m]. Ours
+MEMORY = 64 << 20  # Of the contacts of a simulation [bytes]. Ours: 340 with balls of a cloud overflow 15 MiB, MuJoCo's default
 TABLE_AWAY = (0.0, 0.0, -10.0)  # Place of a table while there is none [m]. Ours
 OBJECT_GROUP = 1  # Group of the object's geoms, and of nothing else, by which rays find them
 CACHED_SCENES = 8  # Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols
@@ -244,6 +245,7 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = 
 
 def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
     scene = mujoco.MjSpec()
+    scene.memory = MEMORY
     option = scene.option
     option.timestep, option.impratio, option.gravity = protocol.timestep, protocol.impratio, [0, 0, 0]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
