@@ -23,6 +23,7 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
+from dro_grasp.hands.description.dialects import MOST_UNKNOWN, drop_unknown
 from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
 from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
@@ -187,13 +188,26 @@ def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
 
 def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
     """What MuJoCo reads from a file and those that it includes, mended in memory where MuJoCo would not read them."""
-    mended = [mend_mjcf_inertials(tree, notes) for tree in trees.values()]
+    mended = any([mend_mjcf_inertials(tree, notes) for tree in trees.values()])
     with mujoco_speaks_to(notes, path):
-        if not any(mended):
-            return mujoco.MjSpec.from_file(str(path))
-        text, *more = (ET.tostring(tree) for tree in trees.values())
-        names = [os.path.relpath(file, path.parent) for file in trees if file != path]
-        spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
+        for _ in range(MOST_UNKNOWN):
+            try:
+                spec = _spec_in_memory(trees, path) if mended else mujoco.MjSpec.from_file(str(path))
+                break
+            except ValueError as error:
+                if not drop_unknown(str(error), trees.values(), notes):
+                    raise
+                mended = True
+        else:
+            spec = _spec_in_memory(trees, path)
+    return spec
+
+
+def _spec_in_memory(trees: Mapping[Path, ET.Element], path: Path) -> mujoco.MjSpec:
+    """The specification of a file and those that it includes as they are in memory; assets are pointed to their files."""
+    text, *more = (ET.tostring(tree) for tree in trees.values())
+    names = [os.path.relpath(file, path.parent) for file in trees if file != path]
+    spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
     spec.modelfiledir = str(path.parent)
     for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
         beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
