@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
+from dro_grasp.hands.description.tendon_limits import tie_by_limits
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
@@ -39,6 +40,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     driven = driven_joints(spec)
     _limit_joints_as_actuators(spec)
     _couple_tendons(spec, notes)
+    tie_by_limits(spec, driven, notes)
     for kind in (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.cameras, spec.lights, spec.tuples, spec.skins):
         for item in list(kind):
             spec.delete(item)
