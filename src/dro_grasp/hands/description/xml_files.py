@@ -11,6 +11,7 @@ import defusedxml.ElementTree
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import command
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer
 
 DEEPEST = 100  # Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30
 MAX_ELEMENTS = 50_000  # Most elements of one file (ours)
@@ -34,6 +35,8 @@ def parse_xml(path: Path) -> ET.Element:
     if path.stat().st_size > MAX_BYTES:
         raise HandError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; expected a robot hand of at most "
                         f"{MAX_BYTES / 1e6:.0f}")
+    if is_pointer(path):
+        raise HandError(f"{path} is a pointer of Git LFS, not the hand; {FETCH}")
     try:
         root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
     except defusedxml.DefusedXmlException as error:
