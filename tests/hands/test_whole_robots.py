@@ -182,7 +182,7 @@ PLATE = '<link name="plate"><visual><geometry><box size="0.05 0.05 0.01"/></geom
 FLAT = claw(PLATE + '<link name="mount"/><joint name="flange" type="fixed"><parent link="mount"/><child link="palm"/></joint>'
             '<joint name="skin" type="fixed"><parent link="palm"/><child link="plate"/></joint>')
 FLAT_MJCF = ("<mujoco><worldbody><body name='mount'><geom size='.02'/><body name='palm'><geom type='box' size='.04 .04 .01'/>"
-             "<body name='left' pos='-.03 0 0'><joint name='a' axis='0 1 0' range='0 80'/><geom size='.01' pos='0 0 .05'/></body>"
+             "<body name='left' pos='-.03 0 0'><joint name='a' axis='0 1 0' range='0 80'/><geom size='.01'/></body>"
              "<body name='plate'><geom type='box' size='.02 .02 .01'/><site/></body></body></body></worldbody></mujoco>")
 
 

@@ -16,7 +16,7 @@ from tests.helpers.claw_urdf import claw, link, meshed, written
 
 POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0f' * 32}\nsize 7172784\n"
 MESH = '<mesh filename="{}"/>'
-MJCF = ("<mujoco><asset><mesh name='tip' file='tip.stl'/></asset><worldbody><body name='palm'><geom type='box' size='.04 .04 .01'/>"
+MJCF = ("<mujoco><asset><mesh name='tip' file='tip.stl'/></asset><worldbody><body name='palm'><geom size='.04'/>"
         "<body name='left' pos='-.035 0 .01'><joint name='a' axis='0 1 0' range='0 90'/><geom type='mesh' mesh='tip'/></body>"
         "</body></worldbody></mujoco>")
 
@@ -62,4 +62,5 @@ def test_meshes_that_were_fetched_are_read(tmp_path: Path) -> None:
     description = load_hand(written(tmp_path, meshed("tip.stl"))).description
     assert description is not None
     left = description.tree.link_names.index("left")
-    assert [np.ptp(g.vertices, axis=0).round(4).tolist() for g in description.geometry if g.link == left] == [[0.012, 0.012, 0.06]] * 2
+    sizes = [np.ptp(g.vertices, axis=0).round(4).tolist() for g in description.geometry if g.link == left]
+    assert sizes == [[0.012, 0.012, 0.06]] * 2

@@ -85,9 +85,9 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
 
 
 def _drop_giants(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[Note]) -> bool:
-    """Leave out meshes larger than any hand of links that have sensible shapes as well, which then collide; False if there are none.
+    """Leave out meshes larger than any hand where all links that have them have other shapes, which then collide.
 
-    In published files these are collision meshes in millimetres beside visual ones in metres.
+    In published files these are collision meshes in millimetres beside visual ones in metres. Returns whether any were left out.
     """
     sizes = {model.mesh(m).name: float(np.ptp(model.mesh_vert[start : start + count], axis=0).max())
              for m, (start, count) in enumerate(zip(model.mesh_vertadr, model.mesh_vertnum, strict=True))}
@@ -103,7 +103,7 @@ def _drop_giants(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[Note]) 
                 geom.contype = geom.conaffinity = 1
     if bodies:
         notes.append(Note("warning", ", ".join(body.name for body in bodies), f"meshes of up to {max(sizes.values()):.0f} m, "
-                          "perhaps in millimetres, are left out, and other shapes collide instead; state the scale of the meshes"))
+                          "perhaps in millimetres, are left out, and other shapes collide instead; state the meshes' scale"))
     for mesh in [mesh for mesh in spec.meshes if mesh.name in giants]:
         spec.delete(mesh)
     return bool(bodies)

@@ -23,12 +23,13 @@ SAY_NOTHING_WITHIN = {"option", "visual", "sensor", "custom"}
 
 
 def drop_unknown(message: str, trees: Iterable[ET.Element], notes: list[Note]) -> bool:
-    """Leave out, in place, the word that MuJoCo refuses; False if it refuses something else, or what may say what the hand is."""
+    """Leave out, in place, the word that MuJoCo refuses; False if it is something else, or may say what the hand is."""
     found = UNKNOWN.search(message)
     if found is None:
         return False
     attribute, tag = found["attribute"], found["element"]
-    dropped = [word for tree in trees for word in (_elements(tree, tag) if attribute is None else _attribute(tree, tag, attribute))]
+    dropped = [word for tree in trees
+               for word in (_elements(tree, tag) if attribute is None else _attribute(tree, tag, attribute))]
     notes.extend(Note("warning", tag, f"has {word}, which MuJoCo {mujoco.__version__} does not know; it is left out")
                  for word in dict.fromkeys(dropped))
     return bool(dropped)

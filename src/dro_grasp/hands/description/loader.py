@@ -159,7 +159,8 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
     if pointers := sorted(str(file) for file in used if os.path.isfile(file) and is_pointer(file)):
-        raise HandError(f"{path}: {len(pointers)} files of meshes or textures are pointers of Git LFS (first: {pointers[0]}); {FETCH}")
+        raise HandError(f"{path}: {len(pointers)} files of meshes or textures are pointers of Git LFS (first: {pointers[0]}); "
+                        f"{FETCH}")
     missing = sorted(str(file) for file in used if not os.path.isfile(file))
     if missing:
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "

@@ -25,7 +25,8 @@ def tie_by_limits(spec: mujoco.MjSpec, driven: set[str], notes: list[Note]) -> N
             continue  # both are led or driven already, and no joint follows two
         followers.add(follower)
         _tie(spec, tendon, follower, leader)
-        notes.append(Note("info", follower, f"follows '{leader}', as the length of tendon '{tendon.name}' is limited to one value"))
+        notes.append(Note("info", follower, f"follows '{leader}', as the length of tendon '{tendon.name}' is limited to one "
+                          "value"))
 
 
 def _tied(tendon: mujoco.MjsTendon) -> tuple[mujoco.MjsTendon, str, str] | None:
