@@ -87,7 +87,7 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
 def _drop_giants(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[Note]) -> bool:
     """Leave out meshes larger than any hand where all links that have them have other shapes, which then collide.
 
-    In published files these are collision meshes in millimetres beside visual ones in metres. Returns whether any were left out.
+    In published files these are collision meshes in millimetres beside visual ones in metres. True if any were left out.
     """
     sizes = {model.mesh(m).name: float(np.ptp(model.mesh_vert[start : start + count], axis=0).max())
              for m, (start, count) in enumerate(zip(model.mesh_vertadr, model.mesh_vertnum, strict=True))}

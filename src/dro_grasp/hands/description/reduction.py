@@ -25,6 +25,11 @@ from dro_grasp.hands.description.tendon_limits import tie_by_limits
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
 BALL_LIMIT = math.pi / 2  # Limits of the three hinges of a ball that states none, both ways from zero [rad] (ours)
+SPECK = 0.004
+"""Extent below which spheres and boxes are no part of a finger [m] (ours); stand-ins of published hands have 2 mm."""
+PLAIN = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE,
+         mujoco.mjtGeom.mjGEOM_ELLIPSOID}
+"""Shapes whose size is stated."""
 SLIDE_LIMIT = 0.05  # Limits of slides that state none, both ways from zero [m] (ours)
 
 
@@ -58,6 +63,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
             spec.delete(joint)
     if not fixed_base:
         _free_wrist(spec, hand, notes)
+    _hold_specks(spec, hand, notes)
     passive = _split_balls(spec, driven, path, notes)
     _check_joints(spec, path, notes)
     couple_closed_loops(spec, driven, path, notes, passive)
@@ -78,6 +84,19 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
             spec.delete(joint)
         below = list(link.bodies)
         link = below[0] if len(below) == 1 and not list(link.geoms) else None
+
+
+def _hold_specks(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:
+    """Delete, in place, joints that move nothing but specks and lead nothing: links that stand for motors are no fingers."""
+    tied = {name for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT for name in (e.name1, e.name2)}
+    for body in [each for each in spec.bodies if each.name not in {"world", hand.name}]:
+        shapes = body.find_all("geom")
+        if not shapes or not all(shape.type in PLAIN and 2 * float(np.max(shape.size)) < SPECK for shape in shapes):
+            continue
+        for joint in [joint for joint in body.joints if joint.name not in tied]:
+            notes.append(Note("info", joint.name, f"moves nothing but shapes of less than {1000 * SPECK:.0f} mm, as those of "
+                              "links that stand for motors; taken as fixed"))
+            spec.delete(joint)
 
 
 def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[Note]) -> set[str]:
