@@ -43,12 +43,14 @@ def parse_xml(path: Path) -> ET.Element:
         raise HandError(f"{path} declares XML entities ({type(error).__name__}), which are refused because they can "
                         "exhaust memory or read other files; remove its <!ENTITY ...> lines") from error
     except (ET.ParseError, UnicodeError) as error:
+        if "unbound prefix" in str(error) and b"<xacro:" in path.read_bytes():
+            raise HandError(f"{path} is a xacro template without xmlns:xacro; {_expanding(path)}") from error
         raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     except (OSError, ValueError, LookupError) as error:
         raise HandError(f"{path} cannot be read ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     assert root is not None  # an empty file is no XML
     _check_elements(root, path)
-    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()):
+    if any("xacro" in str(element.tag).rpartition("}")[0] for element in root.iter()):  # files spell its namespace in many ways
         raise HandError(f"{path} is a xacro template; {_expanding(path)}")
     _refuse_expressions(root, path)
     return root
