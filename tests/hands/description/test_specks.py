@@ -45,3 +45,8 @@ def test_small_links_within_a_finger_and_small_fingers_stay(tmp_path: Path) -> N
     assert load_hand(written(tmp_path, claw(links=chain))).tree.joint_names == ("a", "c", "b")
     small = link("third", '<sphere radius="0.004"/>') + joint("d", "palm", "third", "0 0.03 0.02", "1 0 0")
     assert len(load_hand(written(tmp_path, claw(small))).tips) == 3
+
+
+def test_a_hand_of_nothing_but_specks_keeps_its_joints(tmp_path: Path) -> None:
+    tiny = claw(links=link("left", SHAPES[0]) + link("right", SHAPES[0]))
+    assert load_hand(written(tmp_path, tiny)).tree.joint_names == ("a", "b")

@@ -89,14 +89,15 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
 def _hold_specks(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:
     """Delete, in place, joints that move nothing but specks and lead nothing: links that stand for motors are no fingers."""
     tied = {name for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT for name in (e.name1, e.name2)}
+    still: list[mujoco.MjsJoint] = []
     for body in [each for each in spec.bodies if each.name not in {"world", hand.name}]:
         shapes = body.find_all("geom")
-        if not shapes or not all(shape.type in PLAIN and 2 * float(np.max(shape.size)) < SPECK for shape in shapes):
-            continue
-        for joint in [joint for joint in body.joints if joint.name not in tied]:
-            notes.append(Note("info", joint.name, f"moves nothing but shapes of less than {1000 * SPECK:.0f} mm, as those of "
-                              "links that stand for motors; taken as fixed"))
-            spec.delete(joint)
+        if shapes and all(shape.type in PLAIN and 2 * float(np.max(shape.size)) < SPECK for shape in shapes):
+            still.extend(joint for joint in body.joints if joint.name not in tied)
+    for joint in still if len(still) < len(spec.joints) else ():  # where all are so small, it is the unit
+        notes.append(Note("info", joint.name, f"moves nothing but shapes of less than {1000 * SPECK:.0f} mm, as those of links "
+                          "that stand for motors; taken as fixed"))
+        spec.delete(joint)
 
 
 def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[Note]) -> set[str]:
@@ -238,7 +239,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
             notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
 
 
-def _told_range(limits: Sequence[float]) -> str:
+def _told_range(limits: Float[np.ndarray, "2"]) -> str:
     """Limits that a joint states but that do not count, in words; empty if it states none."""
     low, high = limits
     return "" if low == high == 0 else f"{low:g} to {high:g}" + ("" if low >= high else ", but limited is 'false'")
