@@ -272,7 +272,7 @@ def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 
 Joints = Float[np.ndarray, " n"]  # a value of each joint
-Sweeps = dict[int, Float[np.ndarray, "k n"]]  # by leader, joint values while it goes through its range
+Sweeps = dict[int, Float[np.ndarray, "_ n"]]  # by leader, joint values while it goes through its range
 CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
 STEPS = 32  # Steps from one end of a leader's range to the other (ours)
 SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)
