@@ -62,7 +62,10 @@ class HandReport:
             first, *more = _words(value)
             told.append(f"{name.replace('_', ' '):<{width}}  {first}")
             told.extend(f"{'':<{width}}  {line}" for line in more)
-        found = [f"{note.level}: {note.subject}: {note.text}" for note in self.notes]
+        alike: dict[tuple[str, str], list[str]] = {}
+        for note in self.notes:
+            alike.setdefault((note.level, note.text), []).append(note.subject)
+        found = [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
         return [f"hand {self.hand.name}", *told, "", *(found or ["nothing wrong was found"])]
 
     def to_dict(self) -> dict[str, Any]:

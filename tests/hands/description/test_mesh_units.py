@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from dro_grasp.errors import HandError
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.description.loader import load_description
 from dro_grasp.hands.library import load_hand
@@ -73,3 +74,26 @@ def test_other_formats_that_state_a_unit_are_honoured(tmp_path: Path) -> None:
         archive.writestr("3D/3dmodel.model", model)
     (tmp_path / "tip.3mf").write_bytes(content.getvalue())
     assert size_of_left(written(tmp_path, meshed("tip.3mf"))) == pytest.approx(SIZE, rel=1e-5)
+
+
+def box_of(folder: Path, name: str, unit: float) -> str:
+    """A finger's box in some unit as STL; the element that names it."""
+    trimesh.creation.box(np.divide(SIZE, unit)).export(folder / name)
+    return f'<mesh filename="{name}"/>'
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.0001])
+def test_collision_meshes_in_millimetres_beside_visual_ones_in_metres_are_left_out(tmp_path: Path, unit: float) -> None:
+    large, small = box_of(tmp_path, "large.stl", unit), box_of(tmp_path, "small.stl", 1.0)
+    drawn = link("left", small, ("visual",)).replace("</link>", "") + link("left", large, ("collision",)).split(">", 1)[1]
+    path = written(tmp_path, claw(links=drawn + link("right")))
+    assert size_of_left(path) == pytest.approx(SIZE, rel=1e-5)
+    told = [note.text for note in load_description(path).notes if note.subject == "left"]
+    assert len(told) == 1
+    assert told[0].startswith(f"meshes of up to {0.06 / unit:.0f} m, perhaps in millimetres, are left out, and other shapes")
+
+
+def test_meshes_in_millimetres_alone_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, claw(links=link("left", box_of(tmp_path, "large.stl", 0.001)) + link("right")))
+    with pytest.raises(HandError, match="this looks like millimetres"):
+        load_description(path)

@@ -38,6 +38,15 @@ def test_expressions_of_xacro_are_told(tmp_path: Path, text: str) -> None:
         load_description(written(tmp_path, text))
 
 
+@pytest.mark.parametrize("space", [
+    ' xmlns:xacro="http://www.ros.org/wiki/xacro"', ' xmlns:xacro="http://ros.org/wiki/xacro"',
+    ' xmlns:xacro="http://www.ros.org/wiki/xacro/"', ' xmlns:xacro="http://wiki.ros.org/xacro"', ""])
+def test_a_xacro_template_is_told_whatever_its_namespace(tmp_path: Path, space: str) -> None:
+    text = f'<robot name="claw"{space}><xacro:include filename="fingers.xacro"/></robot>'
+    with pytest.raises(HandError, match=r"is a xacro template.*; expand it first: xacro .*claw\.urdf\.xacro"):
+        load_description(written(tmp_path, text, "claw.urdf.xacro"))
+
+
 def test_expressions_in_names_and_in_what_nobody_reads_do_not_matter(tmp_path: Path) -> None:
     text = claw('<gazebo reference="left"><mu1 value="${mu}"/></gazebo>').replace('"palm"', '"${prefix}palm"')
     assert load_hand(written(tmp_path, text)).tree.joint_names == ("a", "b")

@@ -67,6 +67,8 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
             body.mass = LEAST_MASS
     with mujoco_speaks_to(notes, path):
         model = _compile(spec, notes)
+        if _drop_giants(spec, model, notes):
+            model = _compile(spec, notes)
     _check_numbers(model, path)
     notes.extend(_limit_notes(model))
     return model
@@ -80,6 +82,31 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
             if not _repair(spec, str(error), notes):
                 raise
     return spec.copy().compile()
+
+
+def _drop_giants(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[Note]) -> bool:
+    """Leave out meshes larger than any hand where all links that have them have other shapes, which then collide.
+
+    In published files these are collision meshes in millimetres beside visual ones in metres. True if any were left out.
+    """
+    sizes = {model.mesh(m).name: float(np.ptp(model.mesh_vert[start : start + count], axis=0).max())
+             for m, (start, count) in enumerate(zip(model.mesh_vertadr, model.mesh_vertnum, strict=True))}
+    giants = {name for name, size in sizes.items() if size > MAX_LENGTH}
+    bodies = [body for body in list(spec.bodies)[1:] if giants & {geom.meshname for geom in body.geoms}]
+    if not all(any(geom.meshname not in giants for geom in body.geoms) for body in bodies):
+        return False
+    for body in bodies:
+        for geom in [geom for geom in body.geoms if geom.meshname in giants]:
+            spec.delete(geom)
+        if not any(geom.contype or geom.conaffinity for geom in body.geoms):
+            for geom in body.geoms:
+                geom.contype = geom.conaffinity = 1
+    if bodies:
+        notes.append(Note("warning", ", ".join(body.name for body in bodies), f"meshes of up to {max(sizes.values()):.0f} m, "
+                          "perhaps in millimetres, are left out, and other shapes collide instead; state the meshes' scale"))
+    for mesh in [mesh for mesh in spec.meshes if mesh.name in giants]:
+        spec.delete(mesh)
+    return bool(bodies)
 
 
 def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:

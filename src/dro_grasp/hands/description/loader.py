@@ -22,11 +22,13 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
+from dro_grasp.hands.description.dialects import MOST_UNKNOWN, drop_unknown
 from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
 from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
-from dro_grasp.hands.description.urdf import CONTINUOUS, as_obj, in_any_case, prepare_urdf
+from dro_grasp.hands.description.urdf import CONTINUOUS, MOVING, as_obj, in_any_case, prepare_urdf
 from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
@@ -156,6 +158,9 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
+    if pointers := sorted(str(file) for file in used if os.path.isfile(file) and is_pointer(file)):
+        raise HandError(f"{path}: {len(pointers)} files of meshes or textures are pointers of Git LFS (first: {pointers[0]}); "
+                        f"{FETCH}")
     missing = sorted(str(file) for file in used if not os.path.isfile(file))
     if missing:
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
@@ -187,13 +192,26 @@ def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
 
 def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
     """What MuJoCo reads from a file and those that it includes, mended in memory where MuJoCo would not read them."""
-    mended = [mend_mjcf_inertials(tree, notes) for tree in trees.values()]
+    mended = any([mend_mjcf_inertials(tree, notes) for tree in trees.values()])
     with mujoco_speaks_to(notes, path):
-        if not any(mended):
-            return mujoco.MjSpec.from_file(str(path))
-        text, *more = (ET.tostring(tree) for tree in trees.values())
-        names = [os.path.relpath(file, path.parent) for file in trees if file != path]
-        spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
+        for _ in range(MOST_UNKNOWN):
+            try:
+                spec = _spec_in_memory(trees, path) if mended else mujoco.MjSpec.from_file(str(path))
+                break
+            except ValueError as error:
+                if not drop_unknown(str(error), trees.values(), notes):
+                    raise
+                mended = True
+        else:
+            spec = _spec_in_memory(trees, path)
+    return spec
+
+
+def _spec_in_memory(trees: Mapping[Path, ET.Element], path: Path) -> mujoco.MjSpec:
+    """The specification of a file and those that it includes as they are in memory; assets are pointed to their files."""
+    text, *more = (ET.tostring(tree) for tree in trees.values())
+    names = [os.path.relpath(file, path.parent) for file in trees if file != path]
+    spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
     spec.modelfiledir = str(path.parent)
     for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
         beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
@@ -274,6 +292,7 @@ def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
     ends = _ends(root)
     kept = _below(ends, link)
     _require(link, [element.get("name", "") for element in root.findall("link")], path)
+    _require_fingers(link, {below: (above, joint.get("type") in MOVING) for joint, (above, below) in ends.items()}, path)
     for joint, (above, below) in ends.items():
         if above not in kept or below == link:
             root.remove(joint)
@@ -320,7 +339,10 @@ def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
 
 def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
     """A body of an MJCF and what hangs on it, with the couplings, tendons, actuators and keyframes of its joints."""
-    _require(link, [body.name for body in list(spec.bodies)[1:]], path)
+    bodies = list(spec.bodies)[1:]
+    _require(link, [body.name for body in bodies], path)
+    _require_fingers(link, {body.name: (body.parent.name, bool(body.joints)) for body in bodies
+                             if body.parent.name != "world"}, path)
     part = mujoco.MjSpec()
     part.compiler.degree = spec.compiler.degree
     with mujoco_speaks_to([], path):  # of its options, all of which the protocol sets
@@ -344,6 +366,31 @@ def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
     while grown := {below for above, below in ends.values() if above in found} - found:
         found |= grown
     return found
+
+
+def _require_fingers(link: str, tree: Mapping[str, tuple[str, bool]], path: Path) -> None:
+    """Refuse a link on which nothing moves, by a HandError that names the one above it on which something does.
+
+    Args:
+        link: The link at which the hand should begin.
+        tree: For each link but the root, its parent and whether it moves against it.
+        path: The file.
+    """
+    def carries(top: str) -> bool:
+        found = {top}
+        while grown := {below for below, (above, _) in tree.items() if above in found} - found:
+            found |= grown
+        return any(tree[below][1] for below in found - {top})
+
+    if carries(link):
+        return
+    above = link
+    for _ in tree:  # as often as there are links; a cycle is reported when the tree is built
+        if above in tree and not tree[above][1] and not carries(above):
+            above = tree[above][0]
+    hint = f"; the fingers hang on '{above}', which carries it: give {named(path.name, above)}" if carries(above) else \
+        ", so no hand begins there; give the link that the fingers hang on"
+    raise HandError(f"{path}: nothing that hangs on link '{link}' moves{hint}")
 
 
 def _require(link: str, links: Sequence[str], path: Path) -> None:

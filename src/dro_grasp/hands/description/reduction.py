@@ -20,10 +20,16 @@ from scipy.optimize import least_squares
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
+from dro_grasp.hands.description.tendon_limits import tie_by_limits
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
 BALL_LIMIT = math.pi / 2  # Limits of the three hinges of a ball that states none, both ways from zero [rad] (ours)
+SPECK = 0.004
+"""Extent below which spheres and boxes are no part of a finger [m] (ours); stand-ins of published hands have 2 mm."""
+PLAIN = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE,
+         mujoco.mjtGeom.mjGEOM_ELLIPSOID}
+"""Shapes whose size is stated."""
 SLIDE_LIMIT = 0.05  # Limits of slides that state none, both ways from zero [m] (ours)
 
 
@@ -39,6 +45,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     driven = driven_joints(spec)
     _limit_joints_as_actuators(spec)
     _couple_tendons(spec, notes)
+    tie_by_limits(spec, driven, notes)
     for kind in (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.cameras, spec.lights, spec.tuples, spec.skins):
         for item in list(kind):
             spec.delete(item)
@@ -56,6 +63,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
             spec.delete(joint)
     if not fixed_base:
         _free_wrist(spec, hand, notes)
+    _hold_specks(spec, hand, notes)
     passive = _split_balls(spec, driven, path, notes)
     _check_joints(spec, path, notes)
     couple_closed_loops(spec, driven, path, notes, passive)
@@ -76,6 +84,20 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
             spec.delete(joint)
         below = list(link.bodies)
         link = below[0] if len(below) == 1 and not list(link.geoms) else None
+
+
+def _hold_specks(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:
+    """Delete, in place, joints that move nothing but specks and lead nothing: links that stand for motors are no fingers."""
+    tied = {name for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT for name in (e.name1, e.name2)}
+    still: list[mujoco.MjsJoint] = []
+    for body in [each for each in spec.bodies if each.name not in {"world", hand.name}]:
+        shapes = body.find_all("geom")
+        if shapes and all(shape.type in PLAIN and 2 * float(np.max(shape.size)) < SPECK for shape in shapes):
+            still.extend(joint for joint in body.joints if joint.name not in tied)
+    for joint in still if len(still) < len(spec.joints) else ():  # where all are so small, it is the unit
+        notes.append(Note("info", joint.name, f"moves nothing but shapes of less than {1000 * SPECK:.0f} mm, as those of links "
+                          "that stand for motors; taken as fixed"))
+        spec.delete(joint)
 
 
 def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[Note]) -> set[str]:
@@ -217,7 +239,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
             notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
 
 
-def _told_range(limits: Sequence[float]) -> str:
+def _told_range(limits: Float[np.ndarray, "2"]) -> str:
     """Limits that a joint states but that do not count, in words; empty if it states none."""
     low, high = limits
     return "" if low == high == 0 else f"{low:g} to {high:g}" + ("" if low >= high else ", but limited is 'false'")
@@ -250,7 +272,7 @@ def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 
 Joints = Float[np.ndarray, " n"]  # a value of each joint
-Sweeps = dict[int, Float[np.ndarray, "k n"]]  # by leader, joint values while it goes through its range
+Sweeps = dict[int, Float[np.ndarray, "_ n"]]  # by leader, joint values while it goes through its range
 CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
 STEPS = 32  # Steps from one end of a leader's range to the other (ours)
 SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)

@@ -10,17 +10,19 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NoReturn
 from urllib.parse import unquote
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import reading
-from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer, open_mesh
 from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
 from dro_grasp.hands.description.inertials import mend_urdf_inertials
 from dro_grasp.hands.description.xml_files import DEEPEST
 
 CONTINUOUS = "but is continuous, a type without limits, so they are not used: if it has them, make it revolute"
 """End of the note of a joint whose limits are not used."""
+NOT_FETCHED = "is a pointer of Git LFS"  # Why a mesh that is there has no shape
 MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one degree of freedom
 
 
@@ -208,34 +210,46 @@ def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[lis
     no mesh can be found, and there is no other shape.
     """
     files: dict[str, Path] = {}
-    missing: list[str] = []
+    missing: dict[str, str] = {}
     for link in root.iter("link"):
-        lost = [element for element in [*link.findall("visual"), *link.findall("collision")]
-                if not _resolve_mesh(element, path, files, notes)]
-        for element in lost:
+        shapes = [*link.findall("visual"), *link.findall("collision")]
+        lost = {element: fault for element in shapes if (fault := _resolve_mesh(element, path, files, notes))}
+        for element, fault in lost.items():
             name = element.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
-            missing.append(name)
+            missing[name] = fault
             link.remove(element)
-            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is left out"))
+            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' {fault} and is left out"
+                              f"{f'; {FETCH}' if fault == NOT_FETCHED else ''}"))
         if any(element.tag == "collision" for element in lost) and link.find("collision") is None:
             _collide_with_visuals(link, notes)
     if missing and not files and root.find("link/*/geometry") is None:
-        looked = ", ".join(str(p) for p in _candidates(missing[0], path.parent)[:4])
-        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked for "
-                        f"{looked}); put the meshes beside the URDF or correct the file names")
+        _refuse_meshes(missing, path)
     converted = {name: file for name, file in files.items() if name != str(file)}
     return list(files.values()), converted
 
 
-def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes: list[Note]) -> bool:
-    """Point a shape's mesh to its file, or to a name that stands in for it; False if there is no such file."""
+def _refuse_meshes(missing: dict[str, str], path: Path) -> NoReturn:
+    """Refuse a hand without any shape, whose meshes are missing for these reasons."""
+    first = next(iter(missing))
+    if NOT_FETCHED in missing.values():
+        raise HandError(f"{path}: none of its {len(missing)} meshes can be read: {list(missing.values()).count(NOT_FETCHED)} "
+                        f"{'are pointers' if len(missing) > 1 else 'is a pointer'} of Git LFS (first: '{first}'); {FETCH}")
+    looked = ", ".join(str(p) for p in _candidates(first, path.parent)[:4])
+    raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{first}'; looked for "
+                    f"{looked}); put the meshes beside the URDF or correct the file names")
+
+
+def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes: list[Note]) -> str:
+    """Point a shape's mesh to its file, or to a name that stands in for it; what is wrong if there is none, else nothing."""
     mesh = element.find("geometry/mesh")
     if mesh is None:
-        return True
+        return ""
     name = mesh.get("filename", "")
     file = find_mesh(name, path.parent) or find_mesh(name, path.resolve().parent)
     if file is None:
-        return False
+        return "was not found"
+    if is_pointer(file):
+        return NOT_FETCHED
     if not any(os.path.isfile(candidate) for candidate in _candidates(name, path.parent)):
         told = Note("warning", name, f"was not found, and {file} is taken for it")
         notes.extend([] if told in notes else [told])
@@ -243,7 +257,7 @@ def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes
     stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
     mesh.set("filename", stand_in)
     files[stand_in] = file
-    return True
+    return ""
 
 
 def as_obj(file: Path, notes: list[Note]) -> bytes:

@@ -81,7 +81,7 @@ def _leave_out_scenery(
 
     def is_near(geom: int) -> bool:
         away = np.linalg.norm(bases - data.geom_xpos[geom], axis=1).min() - model.geom_rbound[geom]
-        return model.geom_type[geom] not in SCENERY and model.geom_rbound[geom] < LARGEST_PALM and bool(away < NEAR)
+        return bool(model.geom_type[geom] not in SCENERY and model.geom_rbound[geom] < LARGEST_PALM and away < NEAR)
 
     of_world = np.flatnonzero(model.geom_bodyid == 0).tolist()
     for geom, near in zip(list(spec.worldbody.geoms), map(is_near, of_world), strict=True):
