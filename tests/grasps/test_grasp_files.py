@@ -179,14 +179,16 @@ def test_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("label", [
-    "<img src=x onerror=alert(1)>", "carry/1</b>", "carry\nstrict", "a b", "x" * 5000 + " ", "carry/", "carry/1,strict/1", "+/1"])
+    "<img src=x onerror=alert(1)>", "carry/1</b>", "carry\nstrict", "a b", "x" * 5000 + " ", "carry/",
+    "carry/1,strict/1", "+/1"])
 def test_a_protocol_that_no_trial_could_have_is_refused_when_read_and_when_written(tmp_path, label):
     path = tmp_path / "g.parquet"
     evaluated(3).save(path)
     table = pq.read_table(path)
     column = table.column_names.index("protocol")
     pq.write_table(table.set_column(column, "protocol", pa.array(["strict/1", label, None])), path)
-    for refused in (lambda: GraspBatch.load(path), lambda: evaluated(1).replace(protocol=(label,)).save(tmp_path / "h.parquet")):
+    own = evaluated(1).replace(protocol=(label,))
+    for refused in (lambda: GraspBatch.load(path), lambda: own.save(tmp_path / "h.parquet")):
         with pytest.raises(GraspFileError, match=r"is unknown; trials state a name and a version, such as carry/1") as told:
             refused()
         assert len(str(told.value)) < 600

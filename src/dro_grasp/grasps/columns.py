@@ -68,8 +68,8 @@ def require_fit(batch: Any, n_names: int) -> None:
 def protocol_fault(protocol: Iterable[str]) -> str | None:
     """What is wrong with the first protocol that no trial could have written; None if nothing is."""
     wrong = next((name for name in set(protocol) if name != NOT_EVALUATED and not LABEL.fullmatch(name)), None)
-    return wrong and (f"protocol {wrong[:60]!r} is unknown; trials state a name and a version, such as carry/1, and names are of "
-                      "letters, digits, '_', '-' and '.'")
+    return wrong and (f"protocol {wrong[:60]!r} is unknown; trials state a name and a version, such as carry/1, and names are "
+                      "of letters, digits, '_', '-' and '.'")
 
 
 def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:

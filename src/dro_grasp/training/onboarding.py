@@ -84,9 +84,9 @@ class OnboardingConfig(Checked):
         """Refuse numbers out of range, and a source that does not exist."""
         super().__post_init__()
         if not (math.isfinite(self.minutes) and self.minutes > 0):
-            raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
+            raise OptionError(f"minutes is {self.minutes}; give a positive number, for example minutes=30")
         require_device(self.device)
-        for name, option in (("num", " (--num)"), ("workers", " (--workers)"), ("most_grasps", ""), ("grasps_drawn", "")):
+        for name, option in (("num", " (num=...)"), ("workers", " (workers=...)"), ("most_grasps", ""), ("grasps_drawn", "")):
             if (value := getattr(self, name)) < 1:
                 raise OptionError(f"{name} is {value}; give at least 1{option}")
         if min(shares := (self.data_share, self.training_share)) <= 0 or sum(shares) > 1:
@@ -128,14 +128,14 @@ class Onboarded:
         lines = []
         if not self.gained:
             low, high = difference_interval(held, asked, held_after, asked_after)
-            better = "No more than all can hold" if held == asked else "To gain, try more --minutes or more --objects"
+            better = "No more than all can hold" if held == asked else "To gain, try more minutes or more objects"
             if held_after > held:
-                better += "; to tell a small gain from chance, more --num"
+                better += "; to tell a small gain from chance, evaluate more grasps (num=...)"
             lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under "
                          f"{JUDGE} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
                          f"95 %). Keep the weights from before. {better}.")
         if self.without_grasps:
-            lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
+            lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try objects of a size that suits the "
                          "hand, and look at its picture for a wrong palm side or opening.")
         return lines
 
@@ -165,7 +165,8 @@ def onboard(
     path = check_folder(folder)
     objects, held_out = resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
     if both := sorted(set(objects) & set(held_out)):
-        raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name other --objects or --held-out")
+        raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name others (objects=..., "
+                          "held_out=...)")
     require_known([hand], [*objects, *held_out])
     require_distinct([hand], objects)
     locate_weights(config.weights)
@@ -269,7 +270,7 @@ class _Onboarding:
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
         failures = {obj: why for (_, obj), why in report.failures.items()}
         if not sum(counts.values()):
-            why = "; ".join(dict.fromkeys(failures.values())) or "too little time (--minutes)"
+            why = "; ".join(dict.fromkeys(failures.values())) or "too little time (minutes=...)"
             raise BundleError(f"no grasp of {self.name} held, so there is nothing to train on; look at "
                               f"{self.folder / PICTURE}, and at why: {why}")
         said = (f"{sum(counts.values())} grasps that hold under {config.engine.protocol}, of "

@@ -164,7 +164,7 @@ def test_impossible_requests_are_refused_before_the_work(tmp_path):
 def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     config = EngineConfig(synthesis=SynthesisConfig(device="cuda"))
-    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use --device cpu"):
+    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use device='cpu'"):
         synthesize_dataset(["a"], ["x"], 1, tmp_path, config=config)
 
 
