@@ -130,8 +130,8 @@ def plan(
         start: Where the arm's joints are when the motion begins [rad or m]; home by default. The hand is open.
 
     Raises:
-        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, or no grasp can
-            be carried out; the message counts what was dropped where.
+        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, or no
+            grasp can be carried out; the message counts what was dropped where.
         RobotError: The robot collides with the table, or with itself, at the start.
         OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, the start is out of the joints' range, or
             the constraints leave nothing of the object.

@@ -56,7 +56,7 @@ JUDGE = PROTOCOLS[DEFAULT_PROTOCOL].label  # Protocol by which fine-tuning is ju
 class OnboardingConfig(Checked):
     """How long onboarding takes, and on which objects."""
 
-    minutes: float = 30.0  # time for data, training and trials together [min]
+    minutes: float = 30.0  # time for data, training and trials together [min]; trials are not cut off when it is over
     objects: tuple[str, ...] = ("builtin:train",)  # objects to synthesize grasps of
     held_out: tuple[str, ...] = ("builtin:test",)  # objects of the benchmarks before and after; never trained on
     num: int = 20
@@ -224,10 +224,20 @@ class _Onboarding:
     def run(self) -> None:
         """Run every step that is not finished."""
         self.step("check", self._check)
+        if "after" not in self.steps:
+            self.say(self.plan())
         self.step("before", lambda: self._benchmark(self.config.weights))
         self.step("data", self._data)
         self.step("training", self._training)
         self.step("after", lambda: self._benchmark(str(self.folder / WEIGHTS)))
+
+    def plan(self) -> str:
+        """What takes how long, in one line: the benchmarks are not cut off when the time is over."""
+        config = self.config
+        shares = (f"{config.minutes * share:.3g} min for {what}" for share, what in (
+            (config.data_share, "data"), (config.training_share, "training")))
+        return (f"{' and '.join(shares)}; two benchmarks, each of {config.num} grasps on {len(self.held_out)} objects, take as "
+                "long as they take: fewer objects and grasps are quicker (held_out=..., num=...)")
 
     def step(self, name: str, work: Callable[[], dict[str, Any]]) -> None:
         """Run a step unless it is finished, and store its result."""
@@ -256,10 +266,13 @@ class _Onboarding:
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
-        rows = benchmark([self.hand], objects, [Method(self.config.source, predictor)], config)
+        rows = benchmark([self.hand], objects, [Method(self.config.source, predictor)], config, self._count)
         told = "; ".join(map(_in_words, rows))
         share = f"{rows[-1].optimised:.0%} from the optimiser"
         return {"rows": [row.to_dict() for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
+
+    def _count(self, done: int, total: int) -> None:
+        self.say(f"benchmark: {done} of {total} objects")
 
     def _data(self) -> dict[str, Any]:
         config = self.config
