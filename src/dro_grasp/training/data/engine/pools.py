@@ -9,12 +9,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import connection
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pebble import ProcessExpired, ProcessPool
@@ -134,8 +136,8 @@ class LocalPool:
         return task, result
 
 
-def _one_process() -> ProcessPool:
-    return ProcessPool(1, initializer=use_one_thread, context=multiprocessing.get_context("spawn"))
+def _one_process(begin: Callable[[], None] = use_one_thread) -> ProcessPool:
+    return ProcessPool(1, initializer=begin, context=multiprocessing.get_context("spawn"))
 
 
 def _end(pool: ProcessPool) -> None:
@@ -172,7 +174,7 @@ class RayPool:
         require_extra("ray")
         import ray
 
-        self.process = None if ray.is_initialized() else _one_process()
+        self.process = None if ray.is_initialized() else _one_process(_join_alone)
         try:
             self._ask(_join, job, workers, limit, address or os.environ.get("RAY_ADDRESS"), work)
         except BaseException:
@@ -263,6 +265,20 @@ class RayTasks:
             return task, self.ray.get(ref)
         except self.ray.exceptions.RayError as error:
             return task, Failed(f"its Ray worker was lost ({type(error).__name__})", died=True)
+
+
+def _join_alone() -> None:
+    """Prepare the process that joins a cluster: what Ray prints is no result, and it ends with the one that started it."""
+    use_one_thread()
+    os.dup2(2, 1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 def _join(*arguments: Any) -> None:
