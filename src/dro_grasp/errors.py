@@ -55,6 +55,10 @@ class TrainingError(DroGraspError):
     """Training cannot continue, for example after a non-finite loss."""
 
 
+class ClusterError(DroGraspError):
+    """A cluster of machines on which work is done is gone."""
+
+
 class ServerError(DroGraspError):
     """A grasp server refuses a request, fails, or is not there."""
 

@@ -68,7 +68,7 @@ def test_overlapping_bodies_are_joined(tmp_path: Path):
 
 def test_scale_applies_to_a_mesh_in_millimetres(tmp_path: Path):
     path = save(sphere(30), tmp_path / "ball.stl")
-    with pytest.raises(ObjectError, match=r"measures 60 m, too large .*give --scale 0.001 for millimetres, .* 6 cm$"):
+    with pytest.raises(ObjectError, match=r"measures 60 m, too large .*give scale=0.001 for millimetres, .* 6 cm$"):
         load_file(path)
     assert load_file(path, scale=0.001).extents[0] == pytest.approx(0.06, abs=1e-6)
 
@@ -85,17 +85,17 @@ def test_scale_applies_to_a_mesh_in_millimetres(tmp_path: Path):
 def test_unlikely_sizes_are_refused_with_the_scales_of_units(tmp_path: Path, suffix: str, size: float, hints: list[str]):
     with pytest.raises(ObjectError, match=r"too (large|small) for a hand to grasp") as caught:
         load_file(save(sphere(size / 2), tmp_path / f"ball.{suffix}"))
-    assert str(caught.value).partition("--scale ")[2].split("; --scale ") == hints
+    assert str(caught.value).partition("scale=")[2].split("; scale=") == hints
 
 
 def test_suggested_scale_is_accepted_and_takes_the_place_of_the_one_given(tmp_path: Path):
     path = save(sphere(50.0), tmp_path / "ball.ply")
     for scale in (0.5, 1e-5):
-        with pytest.raises(ObjectError, match=r"--scale 0.001 for millimetres, which makes it 10 cm"):
+        with pytest.raises(ObjectError, match=r"scale=0.001 for millimetres, which makes it 10 cm"):
             load_file(path, scale=scale)
     assert load_file(path, scale=0.001).extents[0] == pytest.approx(0.1)
     path = save(sphere(0.05), tmp_path / "metres.ply")
-    with pytest.raises(ObjectError, match=r"0.1 mm, too small .*--scale 1 for metres, which makes it 10 cm$"):
+    with pytest.raises(ObjectError, match=r"0.1 mm, too small .*scale=1 for metres, which makes it 10 cm$"):
         load_file(path, scale=0.001)
 
 

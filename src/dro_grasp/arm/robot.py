@@ -17,7 +17,7 @@ import torch
 import yaml
 from jaxtyping import Float
 
-from dro_grasp.errors import HandError, RobotError
+from dro_grasp.errors import HandError, OptionError, RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rendering.rasterizer import Camera
@@ -115,6 +115,21 @@ class Robot:
     def working_range(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_arm"]]:
         """The joints' limits, and at most TURN from home."""
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
+
+    def require_start(self, start: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n_arm"]:
+        """Joints of the arm at which a motion may begin [rad or m]; OptionError: they are others, or out of range."""
+        found, names = np.asarray(start, np.float64), ", ".join(self.arm_joints)
+        if found.shape != self.home.shape:
+            raise OptionError(f"start has {found.size} values; robot '{self.name}' has {len(self.home)} arm joints: {names}")
+        for name, q, *limits, low, high in zip(
+            self.arm_joints, found, self.lower, self.upper, *self.working_range, strict=True):
+            if not limits[0] <= q <= limits[1]:
+                raise OptionError(f"start puts joint '{name}' at {q:.4g}, outside its limits {limits[0]:.4g} to "
+                                  f"{limits[1]:.4g}; give radians or metres in the order {names}")
+            if not low <= q <= high:
+                raise OptionError(f"start puts joint '{name}' at {q:.4g}, more than half a turn from `home`, and plans stay "
+                                  f"within {low:.4g} to {high:.4g}; turn it back, or state another `home`")
+        return found
 
     @property
     def open_hand(self) -> Float[np.ndarray, " n_dof"]:

@@ -89,7 +89,7 @@ def pick_object(
     if len(sight.places) > 1 and near is None and mask is None:
         places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in sight.places)
         raise ObjectError(f"'{name}' has {len(sight.places)} things that stand on the table, at {places} m; say which one is "
-                          "wanted by a place near it (--near X Y), or give its points alone")
+                          "wanted by a place near it (near=(X, Y)), or give its points alone")
     height = sight.table_height
     level = replace(robot, table=replace(robot.table, height=height))
     if T is None:

@@ -53,13 +53,14 @@ class Plan:
     scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
     of it."""
+    start: Annotated[tuple[float, ...] | None, optional("Q ...", "the robot's home")] = None
+    """Where the arm's joints are when the motion begins [rad or m], from the base on."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none. A robot
-    without a table has none."""
+    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
@@ -111,16 +112,17 @@ class Plan:
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
         if self.mass is not None:
             obj = with_mass(obj, self.mass)
-        if robot.table is None:
-            say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
-                      "`table` in the robot file")
         lowest = float((obj.cloud @ T_world_object[2, :3]).min() + T_world_object[2, 3])
+        if robot.table is None:
+            say_aside(f"robot '{robot.name}' states no table: the plane below {obj.name}, z = {lowest:.3f} m, is taken for "
+                      "one; state `table` in the robot file")
         if robot.table is not None and lowest > robot.table.height + FLOATS:
             say_aside(f"{obj.name} floats {lowest - robot.table.height:.2f} m above the table; if nothing holds it there, "
                       "say where it is (--camera, --pose, --at)")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        made = (make or plan)(
+            robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start)
         written = self._write(made)
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})

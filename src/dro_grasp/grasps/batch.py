@@ -365,7 +365,7 @@ def load_grasps(path: Path | str) -> GraspBatch:
     path = given_path(path)
     batch = _folder(path) if path.is_dir() else GraspBatch.load(path)
     if len(batch) == 0:
-        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")
+        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without only_successful=True")
     return batch
 
 

@@ -191,14 +191,14 @@ def _one_sided(normals: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
     if np.linalg.norm(normals.mean(0)) <= ONE_SIDED:
         return ()
     return ("its points face mostly one way, and all of them count as the whole object; if they are what one camera saw, give "
-            "its pose with --camera, scanned_object in Python: the side that it did not see is then added",)
+            "its pose with camera=..., scanned_object in Python: the side that it did not see is then added",)
 
 
 def table_note(table: Float[np.ndarray, "4"], removed: int, total: int) -> str:
     """What to say of a table that was cut off."""
     x, y, z, height = (round(float(value), 3) + 0.0 for value in table)
     return (f"a table was found in the cloud (all points where {x:g} x + {y:g} y + {z:g} z = {height:g} m) and {removed} of "
-            f"{total} points were cut off with it; hands stay above it. Keep them with --keep-table, keep_table=True in Python")
+            f"{total} points were cut off with it; hands stay above it. Keep them with keep_table=True")
 
 
 def estimate_normals(
@@ -229,7 +229,7 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
 def check_scale(scale: float) -> None:
     """Refuse a factor that is no positive number, by an ObjectError."""
     if not (math.isfinite(scale) and scale > 0):
-        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+        raise ObjectError(f"scale is {scale}; give a positive number, for example scale=0.001 for millimetres")
 
 
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
@@ -254,10 +254,10 @@ def _scale_hint(largest: float, origin: str) -> str:
     fits = [(unit, scale) for unit, scale in UNITS.items() if SMALLEST <= largest * scale <= FITTING]
     if not fits:
         power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
-        return f"a scale: --scale {power:.3g} makes it {largest * power * 100:.3g} cm"
+        return f"a scale: scale={power:.3g} makes it {largest * power * 100:.3g} cm"
     # After the format's own unit, that comes first which makes it as large as most things that are grasped.
     fits.sort(key=lambda fit: (fit[0] != own, abs(math.log(largest * fit[1] / 0.1))))
-    return "; ".join(f"--scale {scale:g} for {unit}, which makes it {largest * scale * 100:.3g} cm" for unit, scale in fits)
+    return "; ".join(f"scale={scale:g} for {unit}, which makes it {largest * scale * 100:.3g} cm" for unit, scale in fits)
 
 
 LEAST_FILL = 1e-3

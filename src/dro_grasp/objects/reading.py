@@ -29,11 +29,11 @@ CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
     if not path.is_file():
-        raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
+        raise ObjectError(f"no file at {path}; with camera=... give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
-        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
+        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out camera=..., or give a cloud (PLY, NPY, PCD)")
     return coordinates(geometry, str(path)) * unit
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import io
 import os
 import signal
@@ -9,15 +11,18 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 import trimesh
 import viser
+import websockets
 import yaml
 
 from dro_grasp.apps.viewer import grasp_page as module
@@ -352,6 +357,49 @@ def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, m
         assert not set("<{[`") & set(text), text
         assert "**b" not in text
         assert "b**" not in text
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "fov": 0.8, "near": 0.01,
+    "far": 100.0, "image_height": 600, "image_width": 800, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
+"""What a browser says first: with it, viser takes it for one."""
+
+
+async def visit(port: int, entered: threading.Event) -> None:
+    """Open the page as a browser does, and leave when it is there."""
+    protocol, origin = websockets.Subprotocol(f"viser-v{viser.__version__}"), websockets.Origin(f"http://{HOST}:{port}")
+    async with websockets.connect(f"ws://{HOST}:{port}", subprotocols=[protocol], origin=origin, max_size=None) as opened:
+        await opened.send(msgspec.msgpack.encode(CAMERA))
+        await asyncio.to_thread(entered.wait, 60)
+
+
+def test_pages_that_were_closed_leave_nothing_in_memory(studio: Studio) -> None:
+    """Pages refer to themselves, and Python looks for such waste rarely where much is loaded."""
+    entered, pages = threading.Event(), []
+
+    def make(client, turn):
+        made = Studio(client, studio.predictor, "gripper3", "sphere", turn, preview=False)
+        pages.append(weakref.ref(made))
+        entered.set()
+        return made
+
+    served = StudioServer(make, free_port(), HOST)
+    gc.disable()
+    try:
+        for _ in range(4):
+            entered.clear()
+            asyncio.run(visit(served.server.get_port(), entered))
+            end = time.monotonic() + 60
+            while served.studios and time.monotonic() < end:
+                time.sleep(0.05)
+        end = time.monotonic() + 10
+        while sum(page() is not None for page in pages) > 1 and time.monotonic() < end:
+            time.sleep(0.1)
+        assert len(pages) == 4
+        assert sum(page() is not None for page in pages) <= 1, "the last one may be on its way"
+    finally:
+        gc.enable()
+        served.stop()
 
 
 @pytest.mark.slow

@@ -39,6 +39,13 @@ def test_every_pair_gets_its_first_shard_before_any_gets_its_second(tmp_path):
     assert not report.failures
 
 
+def test_hands_take_turns_so_that_a_run_that_ends_early_has_grasps_of_all(tmp_path):
+    _, tasks, _ = run(tmp_path, ["a", "b", "c"], ["x", "y", "z"], 5)
+    hands = [task.shard.hand for task in tasks]
+    assert [hands[:3], hands[3:6], hands[6:]] == [["a", "b", "c"]] * 3
+    assert len({(task.shard.hand, task.shard.object) for task in tasks}) == 9
+
+
 def test_a_rerun_does_only_what_is_missing_and_a_higher_goal_extends(tmp_path):
     run(tmp_path, ["a"], ["x", "y"], 10)
     before = {s: s.path(tmp_path).read_bytes() for s in find_shards(tmp_path)}
@@ -138,7 +145,7 @@ def test_the_next_pair_is_idle_and_has_the_fewest_rounds():
 
 def test_an_object_that_is_being_prepared_is_left_to_one_worker():
     states = {(hand, obj): PairState() for hand in "ab" for obj in "xy"}
-    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("a", "y")
+    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "y")
     states["a", "x"].total = Yield(candidates=64)  # then its parts are in the cache
     states["a", "y"].done = states["b", "y"].done = {0}
     assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "x")
@@ -164,7 +171,7 @@ def test_impossible_requests_are_refused_before_the_work(tmp_path):
 def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     config = EngineConfig(synthesis=SynthesisConfig(device="cuda"))
-    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use --device cpu"):
+    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use device='cpu'"):
         synthesize_dataset(["a"], ["x"], 1, tmp_path, config=config)
 
 

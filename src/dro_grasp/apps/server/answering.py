@@ -125,8 +125,8 @@ class Answerer:
             HandError: The server knows no such hand.
         """
         if name not in (known := self.hand_names()):
-            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with --hand FILE for "
-                            "another one")
+            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with "
+                            f"`dro-grasp serve --hand FILE` for another one")
         return self.library.hand(name)
 
     def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
@@ -140,7 +140,7 @@ class Answerer:
             raise OptionError("a camera is given, and the object is named; send the cloud that the camera saw")
         if sent.name is not None and sent.name not in (known := self.object_names()):
             raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
-                              "/objects); send the mesh or cloud, or start the server with --object FILE")
+                              "/objects); send the mesh or cloud, or start it with `dro-grasp serve --object FILE`")
         key = content_key(sent, camera)
         return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
 

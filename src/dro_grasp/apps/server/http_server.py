@@ -41,8 +41,8 @@ class Access:
 
     def __post_init__(self) -> None:
         if self.host not in LOCAL and not self.token:
-            raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
-                              "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
+            raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (token=..., "
+                              "or the environment variable DRO_GRASP_TOKEN), or serve this machine only (host='127.0.0.1')")
         if not 0 < self.megabytes <= 1000:
             raise OptionError(f"megabytes is {self.megabytes}; give a number above 0, and at most 1000")
 
@@ -214,13 +214,13 @@ def metrics_text(queue: RequestQueue) -> str:
 def listening_socket(host: str, port: int) -> socket.socket:
     """A socket that listens at an address."""
     if not 0 <= port < 2**16:
-        raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
+        raise OptionError(f"port is {port}; give a number up to 65535, for example port=8090, or 0 for any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
-        raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another --port, or --host "
-                          "127.0.0.1 for this machine only") from error
+        raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another port, or "
+                          "host='127.0.0.1' for this machine only") from error
 
 
 class StoppingServer(uvicorn.Server):

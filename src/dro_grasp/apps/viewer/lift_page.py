@@ -236,7 +236,7 @@ def lift_page(
         return page
     attempts = read_attempts(file)
     if not 0 <= chosen < len(attempts):
-        raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; --attempt is {chosen}")
+        raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; attempt={chosen} is none of them")
     if robot is not None:
         attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
     first = load_robot(attempts[chosen].robot_file or attempts[chosen].robot)

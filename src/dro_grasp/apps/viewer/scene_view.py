@@ -327,14 +327,14 @@ class ServedPage:
             OptionError: The port is invalid, or the host is no address of this machine.
         """
         if not 0 < port < 2**16:
-            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example --port 8080")
+            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example port=8080")
         if not host:
-            raise OptionError(f"host is empty; give --host {HOST} for this machine only, or 0.0.0.0 for the whole network")
+            raise OptionError(f"host is empty; give host={HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
             # viser would search for a free port forever.
             socket.create_server((host, 0)).close()
         except OSError as error:
-            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine only, or "
+            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give host={HOST} for this machine only, or "
                               "0.0.0.0 for the whole network") from error
         # viser prints a banner to stdout, which is reserved for tables and JSON.
         self.token = token or (None if host in LOCAL else secrets.token_urlsafe(TOKEN_BYTES))

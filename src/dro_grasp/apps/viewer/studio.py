@@ -5,6 +5,7 @@ Every browser has a page of its own.
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable
@@ -283,3 +284,5 @@ class StudioServer(ServedPage):
     def _close(self, number: int) -> None:
         if (studio := self.studios.pop(number, None)) is not None:
             studio.close()
+            del studio
+            gc.collect()  # pages refer to themselves, and hold meshes; Python alone looks for such waste rarely
