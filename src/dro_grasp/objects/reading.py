@@ -72,8 +72,8 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
         loaded = open_mesh(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    if isinstance(geometry, trimesh.PointCloud):
-        return _with_normals(geometry), unit
+        if isinstance(geometry, trimesh.PointCloud):
+            return _with_normals(geometry), unit
     if not isinstance(geometry, trimesh.Trimesh):
         raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
                           "point cloud as PLY, NPY or PCD")

@@ -16,8 +16,9 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, dropped_note, estimate_normals, table_note
+from dro_grasp.objects.loading import check_scale, check_view, cloud_object, dropped_note, estimate_normals, table_note
 from dro_grasp.objects.perception.completion import complete_cloud
+from dro_grasp.objects.perception.things import one_thing
 from dro_grasp.objects.reading import in_rows, numbers, read_points, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -149,14 +150,17 @@ def scanned_object(
     total, table = len(kept), None if keep_table else table_plane(kept, camera)
     if table is not None:
         kept = kept[above_plane(kept, table)]
-    cut = total - len(kept)
+    cut, own, apart = total - len(kept), slice(None), ()
+    if not keep_table:
+        own, apart = one_thing(kept, table is not None, name)
+    kept = kept[own]
     if len(kept) > CLOUD_POINTS:
         kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
     if denoise and len(kept) > NEIGHBOURS:
         kept = without_outliers(kept)
     if len(kept) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
-    check_extent(kept, name)
+    check_view(kept, name)
     if float((kept @ kept.mean(0)).min()) <= 0:
         raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
                           "camera's frame")
@@ -172,7 +176,7 @@ def scanned_object(
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
     cut_off = () if table is None else (table_note(table, cut, total),)
-    return replace(obj, table=table, notes=(*obj.notes, *dropped, *cut_off))
+    return replace(obj, table=table, notes=(*obj.notes, *dropped, *cut_off, *apart))
 
 
 def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
