@@ -6,6 +6,7 @@ import io
 import json
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
@@ -228,6 +229,40 @@ def test_a_pose_that_is_none_is_refused(depth: np.ndarray, T_object_camera: np.n
         T[:3, 3] = [400.0, 0, 800.0]
     with pytest.raises(OptionError, match="T_frame_camera is not the camera's pose"):
         scanned_object("mug", depth_points(depth, INTRINSICS), T)
+
+
+def ball_before_a_camera() -> tuple[np.ndarray, np.ndarray]:
+    """Points of the near side of a ball half a metre off [m], and its normals, which are exact."""
+    normals = np.random.default_rng(0).normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] < -0.2]
+    return 0.04 * normals + [0, 0, 0.5], normals
+
+
+@pytest.mark.parametrize(("given", "used", "told"), [
+    (lambda n: n, True, None), (lambda n: -n, True, "pointed away from the camera and were turned"),
+    (lambda n: np.where(np.arange(len(n))[:, None] % 2 == 0, n, -n), False, "to both sides of one surface, so they were not"),
+    (lambda n: np.where(n[:, :1] > 0, n, -n), False, "do not all face the camera, so they were not"),
+    (lambda n: n * np.linspace(0.1, 5, len(n))[:, None], False, "not all one length, so they were not used"),
+    (lambda n: 0 * n, False, "not all one length, so they were not used")])
+def test_normals_of_a_camera_s_file_are_used_where_they_face_it(
+    given: Any, used: bool, told: str | None, tmp_path: Path, T_object_camera: np.ndarray
+) -> None:
+    points, normals = ball_before_a_camera()
+    rows = np.column_stack([1000 * points, given(normals)])
+    head = "".join(f"property double {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    text = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{head}end_header\n"
+    (tmp_path / "scan.ply").write_text(text + "\n".join(" ".join(map(repr, row)) for row in rows.tolist()))
+    scan = load_scan(tmp_path / "scan.ply", T_object_camera, 0.001)
+    assert scan.seen is not None
+    index = KDTree(scan.cloud).query(scan.seen)[1]
+    R, t = T_object_camera[:3, :3], T_object_camera[:3, 3]
+    centre = R @ [0, 0, 0.5] + t
+    off = np.abs(scan.cloud_normals[index] - (scan.seen - centre) / 0.04).max(1)
+    assert (np.median(off) < 1e-4) == used
+    assert np.median(off) < 0.3, "estimated ones face the camera as well"
+    assert [note for note in scan.notes if "its normals" in note] == [note for note in scan.notes if told and told in note]
+    assert any("its normals" in note for note in scan.notes) == (told is not None)
 
 
 @pytest.mark.parametrize("scale", [-1.0, 0.0, float("nan")])
