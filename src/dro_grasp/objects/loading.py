@@ -326,8 +326,12 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
 
 
 def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+    before = len(mesh.faces)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
+    if mesh.is_watertight:
+        notes.append(f"{before - len(mesh.faces)} repeated faces or faces without area were left out")
+        return
     trimesh.repair.fill_holes(mesh)
     notes.append("holes were closed" if mesh.is_watertight else
                  "not watertight: distances use winding numbers, which cope with small holes")

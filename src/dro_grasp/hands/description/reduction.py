@@ -393,7 +393,7 @@ class Linkage:
         self.data = mujoco.MjData(self.model)
         self.lower, self.upper = self.model.jnt_range.T
         self.start = self.model.qpos0.clip(self.lower, self.upper)
-        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0)
+        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0) if self.model.njnt else np.zeros(0)
         self.springs = SPRING * np.sqrt(springs / max(springs.max(initial=0.0), 1e-12))
 
     def gaps(self, q: Joints, ties: Sequence[int]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
