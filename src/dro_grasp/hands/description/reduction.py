@@ -305,7 +305,7 @@ def couple_closed_loops(
 
     Passive joints lead nothing: what ties leave free of them stays as it is.
     """
-    if not any(e.active and not is_linear(e) for e in spec.equalities):
+    if not spec.joints or not any(e.active and not is_linear(e) for e in spec.equalities):
         return
     linkage, ties = Linkage(spec, path), [e for e in spec.equalities if e.active]
     for group in linkage.groups():
@@ -393,7 +393,7 @@ class Linkage:
         self.data = mujoco.MjData(self.model)
         self.lower, self.upper = self.model.jnt_range.T
         self.start = self.model.qpos0.clip(self.lower, self.upper)
-        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0) if self.model.njnt else np.zeros(0)
+        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0)
         self.springs = SPRING * np.sqrt(springs / max(springs.max(initial=0.0), 1e-12))
 
     def gaps(self, q: Joints, ties: Sequence[int]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
