@@ -266,7 +266,7 @@ def _depth(rng: Rng, seeds: Path, folder: Path) -> Path:
         name = rng.choice(list(damaged))
         damaged[name] = damaged[name] * rng.choice((1e-3, 2, 1e3, 1e4, -1, 1e30))
     path = folder / "depth.npz"
-    np.savez(path, **{name: tensor.numpy() for name, tensor in damaged.items()})
+    np.savez(path, **{name: tensor.numpy() for name, tensor in damaged.items()})  # type: ignore[arg-type]
     return path
 
 

@@ -47,7 +47,7 @@ def balls(count: int) -> trimesh.Trimesh:
     each = [trimesh.creation.icosphere(2, 0.01) for _ in range(count)]
     for i, one in enumerate(each):
         one.apply_translation((0.036 * (i % 6), 0.03 * (i // 6), 0))
-    return trimesh.util.concatenate(each)
+    return trimesh.util.concatenate(each)  # pyright: ignore[reportReturnType]
 
 
 def sheet(side: float) -> trimesh.Trimesh:
@@ -62,7 +62,7 @@ def soup(faces: int) -> trimesh.Trimesh:
 def joined(mesh: trimesh.Trimesh, x: float, y: float, z: float) -> trimesh.Trimesh:
     other = mesh.copy()
     other.apply_translation((x, y, z))
-    return trimesh.util.concatenate([mesh, other])
+    return trimesh.util.concatenate([mesh, other])  # pyright: ignore[reportReturnType]
 
 
 def changed(mesh: trimesh.Trimesh, vertices: Any = None, faces: Any = None) -> trimesh.Trimesh:

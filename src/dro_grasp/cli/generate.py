@@ -190,8 +190,7 @@ class Generate:
 
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept, picture)
-        seconds["files"] = time.perf_counter() - middle
-        seconds["total"] = sum(job.seconds.values()) + time.perf_counter() - begin
+        seconds |= {"files": time.perf_counter() - middle, "total": sum(job.seconds.values()) + time.perf_counter() - begin}
         report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)

@@ -37,4 +37,4 @@ def _spacing(points: Float[np.ndarray, "n 3"]) -> float:
     """Distance within which nearly every point has two neighbours [m], of a thinned cloud."""
     thin = points[one_per_cell(points, CELL / 4)]
     some = thin[:: max(1, len(thin) // 2000)]
-    return float(np.quantile(KDTree(thin).query(some, k=[min(3, len(thin))])[0], 0.9))
+    return float(np.quantile(KDTree(thin).query(some, k=min(3, len(thin)))[0].reshape(len(some), -1)[:, -1], 0.9))

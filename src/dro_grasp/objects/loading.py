@@ -255,12 +255,12 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
 
 def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
     """Refuse clouds of implausible sizes, as `check_extent` does; those as large as a view may be one."""
-    try:
-        check_extent(points, origin, scale)
-    except ObjectError as error:
-        if LARGEST < np.ptp(points, axis=0).max() <= FARTHEST_VIEW:
-            raise ObjectError(f"{error}. If it is a camera's view in metres, cut out the object that is meant") from None
-        raise
+    largest = float(np.ptp(points, axis=0).max())
+    if LARGEST < largest <= FARTHEST_VIEW:
+        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in metres, "
+                          "cut out the object that is meant; if its unit is not the metre, give "
+                          f"{_scale_hint(largest / scale, origin)}")
+    check_extent(points, origin, scale)
 
 
 def _scale_hint(largest: float, origin: str) -> str:

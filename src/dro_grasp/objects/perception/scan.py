@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -154,30 +155,9 @@ def scanned_object(
         OptionError: The pose is no rigid motion.
     """
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
-    rows = given_points(points, name)
-    there, camera = returned(rows[:, :3]), np.zeros(3)
-    dropped = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
-    rows = rows[there]
-    rows = rows[distinct_points(rows[:, :3])]
-    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
-    if table is not None:
-        rows = rows[above_plane(rows[:, :3], table)]
-    cut, apart = total - len(rows), ()
-    if not keep_table:
-        own, apart = one_thing(rows[:, :3], table is not None, name)
-        rows = rows[own]
-    if len(rows) > CLOUD_POINTS:
-        rows = rows[np.random.default_rng(0).permutation(len(rows))[:CLOUD_POINTS]]
-    if denoise and len(rows) > NEIGHBOURS:
-        rows = rows[ordinary(rows[:, :3])]
-    kept = rows[:, :3]
-    if len(kept) < NEIGHBOURS:
-        raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
-    check_view(kept, name)
-    if float((kept @ kept.mean(0)).min()) <= 0:
-        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
-                          "camera's frame")
-    normals, odd = facing_normals(rows, name)
+    clean = _cleaned(given_points(points, name), name, denoise, keep_table)
+    kept, table, camera = clean.rows[:, :3], clean.table, np.zeros(3)
+    normals, odd = facing_normals(clean.rows, name)
     if normals is None:
         normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
@@ -190,8 +170,44 @@ def scanned_object(
         table = None if table is None else moved_plane(table, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
-    cut_off = () if table is None else (table_note(table, cut, total),)
-    return replace(obj, table=table, notes=(*obj.notes, *dropped, *cut_off, *apart, *odd))
+    cut_off = () if table is None else (table_note(table, clean.cut, clean.total),)
+    return replace(obj, table=table, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
+
+
+class Cleaned(NamedTuple):
+    """What is the object's of a camera's points."""
+
+    rows: Float[np.ndarray, "n columns"]  # Points [m], and normals if there are any
+    table: Float[np.ndarray, "4"] | None  # The table that was cut off: its normal and its height [m]
+    cut: int  # Points that went with it
+    total: int  # Points before
+    notes: tuple[str, ...]  # What to say of the others
+
+
+def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, keep_table: bool) -> Cleaned:
+    """The points that are the object's; an ObjectError if they are none."""
+    there, camera = returned(rows[:, :3]), np.zeros(3)
+    told = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
+    rows = rows[there]
+    rows = rows[distinct_points(rows[:, :3])]
+    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
+    if table is not None:
+        rows = rows[above_plane(rows[:, :3], table)]
+    cut = total - len(rows)
+    if not keep_table:
+        own, apart = one_thing(rows[:, :3], table is not None, name)
+        rows, told = rows[own], (*told, *apart)
+    if len(rows) > CLOUD_POINTS:
+        rows = rows[np.random.default_rng(0).permutation(len(rows))[:CLOUD_POINTS]]
+    if denoise and len(rows) > NEIGHBOURS:
+        rows = rows[ordinary(rows[:, :3])]
+    if len(rows) < NEIGHBOURS:
+        raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
+    check_view(rows[:, :3], name)
+    if float((rows[:, :3] @ rows[:, :3].mean(0)).min()) <= 0:
+        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
+                          "camera's frame")
+    return Cleaned(rows, table, cut, total, told)
 
 
 def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n columns"]:
