@@ -170,13 +170,10 @@ SQUASHED = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
 @pytest.mark.parametrize(("fault", "said"), [
-    (change("mount/link", "link9"), "link 'link9', which the arm does not have"),
-    (change("mount/link", "link5"), "joints joint6, joint7 of the arm do not move link 'link5'"),
     (change("limits/acceleration", None), "have no acceleration limit"),
     (change("limits/velocity", -1), "expected a number above 0"),
     (change("limits/velocity", 10**400), "expected a number above 0"),
     (change("home/joint2", 5.0), "outside its limits"),
-    (change("limits/position", {"joint1": [-170.0, 170.0]}), "looks like degrees"),
     (change("limits/position", {"joint1": ["-pi", "pi"]}), "joint 'joint1' is ['-pi', 'pi']; expected [lower, upper]"),
     (change("limits/position", {"joint1": ["-3", "3"]}), "is ['-3', '3']; expected [lower, upper], numbers in rad or m"),
     (change("limits/position", {"joint1": [float("nan"), 3]}), "is [nan, 3]; expected [lower, upper]"),
@@ -184,14 +181,10 @@ SQUASHED = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     (change("limits/position", {"joint1": [3, -3]}), "is [3, -3]; expected [lower, upper]"),
     (change("home/joint2", 10**400), "expected a number"),
     (change("home/joint2", None), "home lacks joint 'joint2'"),
-    (change("home/elbow", 0.1), "joint 'elbow', which the arm does not have"),
     (change("camera/T_world_camera", SQUASHED), "no rigid motion"),
     (change("camera/focal", 0), "camera: focal is 0"),
     (change("mount/quaternion_wxyz", [1, 1, 0, 0]), "has length 1.41421"),
-    (change("tabel", {}), "has an entry 'tabel'"),
-    (change("arm", "nowhere.urdf"), "nowhere.urdf"),
     (change("table/size", [0, 1]), "expected metres above 0"),
-    (change("hand", "no_such_hand"), "no_such_hand"),
 ])
 def test_a_bad_robot_file_is_refused_in_words(
     fault: Any, said: str, values: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from dro_grasp.errors import DroGraspError, ObjectError
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.loading import MIN_CLOUD, cloud_object, estimate_normals, load_file
+from dro_grasp.objects.loading import cloud_object, estimate_normals, load_file
 from dro_grasp.objects.shape import CLOUD_POINTS
 
 
@@ -142,23 +142,9 @@ def test_cut_pcd_is_refused(tmp_path: Path, kind: str):
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
-    [(b"not a cloud at all", "no DATA line"), (b"FIELDS x y\nPOINTS 1\nDATA ascii\n0 0\n", "damaged"),
-     (b"FIELDS x y z\nPOINTS 1\nDATA zipped\n", "zipped data; save the cloud as ascii"),
-     (b"FIELDS x y z\nPOINTS 1\nDATA\n", "damaged")])
-def test_foreign_pcd_is_refused(tmp_path: Path, data: bytes, message: str):
-    (tmp_path / "c.pcd").write_bytes(data)
-    with pytest.raises(ObjectError, match=message):
-        load_file(tmp_path / "c.pcd")
-
-
-@pytest.mark.parametrize(
     ("points", "message"),
-    [(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), f"3 distinct points; a cloud needs at least {MIN_CLOUD}"),
-     (np.full((500, 3), 0.1), "1 distinct points"), (np.zeros((0, 3)), "0 distinct points"),
-     (np.full((200, 3), np.nan), "0 distinct points"),
-     (np.zeros((20, 4)), r"shape \(20, 4\); expected \(n, 3\)"), (np.zeros(30), r"shape \(30,\)"),
-     (40 * directions(200), r"too large .*0.001"), (np.array(["a", "b"]), "expected a plain NPY array")])
+    [(np.zeros((0, 3)), "0 distinct points"), (np.zeros((20, 4)), r"shape \(20, 4\); expected \(n, 3\)"),
+     (np.zeros(30), r"shape \(30,\)"), (np.array(["a", "b"]), "expected a plain NPY array")])
 def test_unusable_clouds_are_refused(tmp_path: Path, points: np.ndarray, message: str):
     np.save(tmp_path / "c.npy", points)
     with pytest.raises(ObjectError, match=message):
@@ -215,13 +201,6 @@ def test_estimated_normals_of_a_box_point_outward():
     true = trimesh.creation.box((0.1, 0.1, 0.1)).face_normals[face]
     inner = np.sort(np.abs(points), axis=1)[:, 1] < 0.04  # away from the edges
     assert (normals * true).sum(1)[inner].min() > 0.98
-
-
-def test_columns_that_are_no_normals_are_refused(tmp_path: Path) -> None:
-    colours = np.random.default_rng(0).uniform(0, 255, (500, 3))
-    np.save(tmp_path / "c.npy", np.concatenate([0.04 * directions(500), colours], 1))
-    with pytest.raises(ObjectError, match="in its columns 4 to 6, which are no normals"):
-        load_file(tmp_path / "c.npy")
 
 
 @pytest.mark.parametrize("header", [

@@ -35,6 +35,7 @@ BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in rob
 HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
 Read = TypeVar("Read")
 POSE_KEYS = {"position", "quaternion_wxyz"}  # What a robot file states of a pose
+FARTHEST_MOUNT = 2.0  # Largest distance of a hand from the link that carries it [m] (ours)
 TURN = np.pi  # Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)
 
 
@@ -306,7 +307,7 @@ class _RobotFile:
         self.hand = named(file, link) if Path(file).is_file() else hand
         faults = self.faults = Faults(path)
         self.mount = faults.of(lambda: self._mount(values), {"faulty": True})
-        self.T_link_wrist = faults.of(lambda: self.pose(self.mount, "mount"), np.eye(4))
+        self.T_link_wrist = faults.of(lambda: self.pose(self.mount, "mount", FARTHEST_MOUNT), np.eye(4))
         self.T_world_base = faults.of(
             lambda: self.pose(self.mapping(values.get("base", {}), "base", POSE_KEYS), "base"), np.eye(4))
         self.home = faults.of(lambda: self._home(values.get("home")), None)
@@ -356,9 +357,11 @@ class _RobotFile:
             raise self.error(f"{what} is {value!r}; expected {count} numbers in brackets")
         return [self.number(v, what) for v in value]
 
-    def pose(self, values: dict[str, Any], what: str) -> Float[np.ndarray, "4 4"]:
+    def pose(self, values: dict[str, Any], what: str, farthest: float = np.inf) -> Float[np.ndarray, "4 4"]:
         T = np.eye(4)
         T[:3, 3] = self.numbers(values.get("position", [0, 0, 0]), f"{what}: position", 3)
+        if (far := float(np.linalg.norm(T[:3, 3]))) > farthest:
+            raise self.error(f"{what}: position is {far:g} m off, as of millimetres; expected at most {farthest:g} m")
         wxyz = np.array(self.numbers(values.get("quaternion_wxyz", [1, 0, 0, 0]), f"{what}: quaternion_wxyz", 4))
         if abs(float(np.linalg.norm(wxyz)) - 1) > 1e-3:
             raise self.error(f"{what}: quaternion_wxyz has length {np.linalg.norm(wxyz):g}; expected 1")

@@ -79,7 +79,7 @@ def pick_object(
     if robot.table is None:
         raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
                          "object's points alone")
-    given, T = given_points(points, name), None if T_world_camera is None else given_pose(T_world_camera)
+    given, T = given_points(points, name)[:, :3], None if T_world_camera is None else given_pose(T_world_camera)
     wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
     if wanted is not None and wanted.shape != (len(given),):
         raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")

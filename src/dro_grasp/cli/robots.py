@@ -156,10 +156,11 @@ class Plan:
         from dro_grasp.errors import OptionError
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
+        from dro_grasp.geometry.table_plane import table_plane
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.loading import read_geometry
         from dro_grasp.objects.perception.scan import load_scan
-        from dro_grasp.objects.reading import read_points
+        from dro_grasp.objects.reading import coordinates, read_points, returned
 
         if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
             raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
@@ -175,8 +176,10 @@ class Plan:
             return PickedObject(load_scan(path, camera), [], robot), T
         if self.pose is None and self.at is None and robot.table is not None and path.is_file():
             found, unit = read_geometry(path)  # a table is larger than any object that is loaded
-            if isinstance(found, np.ndarray) and found.ndim == 2 and sees_table(found[:, :3] * unit, robot.table):
-                return pick_object(path.stem, found[:, :3] * unit, robot), T
+            if isinstance(found, np.ndarray):
+                found = coordinates(found, str(path)) * unit
+                if sees_table(found, robot.table) or table_plane(found[returned(found)]) is not None:
+                    return pick_object(path.stem, found, robot), T
         obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
@@ -186,8 +189,6 @@ class Plan:
                 robot = replace(robot, table=Table(0.0, self.at))
             assert robot.table is not None
             T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
-        elif obj.is_cloud and robot.table is not None and obj.table is not None:
-            return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
         return PickedObject(obj, [], robot), T
 
     def _camera(self, robot: Robot) -> Float[np.ndarray, "4 4"] | None:

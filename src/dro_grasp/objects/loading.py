@@ -17,6 +17,7 @@ from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
+from dro_grasp.objects.perception.things import one_thing
 from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -28,6 +29,7 @@ UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "metres": 
 UNIT_OF = {".stl": "millimetres", ".3mf": "millimetres", ".off": "millimetres", ".glb": "metres", ".gltf": "metres",
            ".dae": "metres", ".obj": "centimetres"}
 """Units of formats, or what most programs write in them (ours); of others, metres."""
+FARTHEST_VIEW = 20.0  # Largest extent of a view of a depth camera [m] (ours)
 FARTHEST = 100.0  # Largest coordinate [m] (ours): single precision rounds it by 4 micrometres
 MIN_CLOUD = 16  # Fewest distinct points of a bare cloud (ours)
 ONE_SIDED = 0.3  # Mean of the normals above which a cloud is one side of an object [1] (ours)
@@ -118,9 +120,13 @@ def cloud_object(
     if table is not None:
         kept = above_plane(xyz, table)
         xyz, points = xyz[kept], points[kept]
+    cut = () if table is None else (table_note(table, total - len(points), total),)
+    if not keep_table:
+        own, apart = one_thing(xyz, table is not None, origin)
+        xyz, points, cut = xyz[own], points[own], (*cut, *apart)
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
-        check_extent(xyz, origin, scale)
+        check_view(xyz, origin, scale)
     if len(xyz) < MIN_CLOUD:
         raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
@@ -128,7 +134,6 @@ def cloud_object(
     normals, odd = given_normals(cloud, points[keep, 3:], origin, named_normals)
     has_normals = normals is not None
     normals = normals if normals is not None else estimate_normals(cloud)
-    cut = () if table is None else (table_note(table, total - len(points), total),)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
     estimated = "" if has_normals else "; normals were estimated"
     return ObjectModel(
@@ -248,6 +253,16 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
                       f"{_scale_hint(largest / scale, origin)}")
 
 
+def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
+    """Refuse clouds of implausible sizes, as `check_extent` does; those as large as a view may be one."""
+    largest = float(np.ptp(points, axis=0).max())
+    if LARGEST < largest <= FARTHEST_VIEW:
+        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in metres, "
+                          "cut out the object that is meant; if its unit is not the metre, give "
+                          f"{_scale_hint(largest / scale, origin)}")
+    check_extent(points, origin, scale)
+
+
 def _scale_hint(largest: float, origin: str) -> str:
     """Scales that make a thing that measures so much in its file [the file's unit] fit a hand, the likeliest first."""
     own = UNIT_OF.get(Path(origin).suffix.lower(), "metres")
@@ -311,8 +326,12 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
 
 
 def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+    before = len(mesh.faces)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
+    if mesh.is_watertight:
+        notes.append(f"{before - len(mesh.faces)} repeated faces or faces without area were left out")
+        return
     trimesh.repair.fill_holes(mesh)
     notes.append("holes were closed" if mesh.is_watertight else
                  "not watertight: distances use winding numbers, which cope with small holes")

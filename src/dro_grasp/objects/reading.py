@@ -28,13 +28,20 @@ CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
+    return read_rows(path)[:, :3]
+
+
+def read_rows(path: Path) -> Float[np.ndarray, "n columns"]:
+    """The same, with the normals that the file has of them in three more columns."""
     if not path.is_file():
         raise ObjectError(f"no file at {path}; with camera=... give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
         raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out camera=..., or give a cloud (PLY, NPY, PCD)")
-    return coordinates(geometry, str(path)) * unit
+    rows = in_rows(geometry)
+    points = coordinates(rows, str(path)) * unit
+    return np.column_stack([points, rows[:, 3:]]) if rows.shape[1] == 6 else points
 
 
 def coordinates(cloud: Shaped[np.ndarray, "..."], origin: str) -> Float[np.ndarray, "n 3"]:
@@ -72,8 +79,8 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
         loaded = open_mesh(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    if isinstance(geometry, trimesh.PointCloud):
-        return _with_normals(geometry), unit
+        if isinstance(geometry, trimesh.PointCloud):
+            return _with_normals(geometry), unit
     if not isinstance(geometry, trimesh.Trimesh):
         raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
                           "point cloud as PLY, NPY or PCD")

@@ -51,6 +51,8 @@ def test_absurd_numbers_of_a_urdf_are_refused_by_name(tmp_path: Path, text: str,
 
 @pytest.mark.parametrize(("text", "message"), [
     (mjcf().replace("range=", 'ref="1e30" range=', 1), r"the reference of joint 'j1' is 1e\+30"),
+    (mjcf('<site name="eye" pos="0 -inf 0"/>', after='<equality><connect site1="eye" site2="eye"/></equality>'),
+     "the place of site 'eye' is 0 -inf 0"),
     (mjcf(after='<equality><joint joint1="j1" joint2="j30" polycoef="0 1e30 0 0 0"/></equality>'), "coupling of joint 'j1'"),
     (mjcf(after='<equality><joint joint1="j1"/><joint joint1="j30"/></equality>'), "every joint follows another"),
     (mjcf('<replicate count="1000000" euler="0 0 1"><body><geom size="0.01"/></body></replicate>'), "1000 links"),

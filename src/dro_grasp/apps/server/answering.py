@@ -30,8 +30,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
-from dro_grasp.objects.perception.scan import scanned_object
-from dro_grasp.objects.reading import read_points
+from dro_grasp.objects.perception.scan import load_scan, scanned_object
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.config import GraspRequest
@@ -164,8 +163,9 @@ class Answerer:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
             check_scale(sent.scale)
             T, named = sent_pose(camera), isinstance(source, Path)
-            points = read_points(source) if named else source
-            return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+            if named:
+                return load_scan(source, T.numpy(), sent.scale, sent.keep_table)
+            return scanned_object("cloud", source * sent.scale, T.numpy(), keep_table=sent.keep_table)
 
 
 def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:

@@ -37,7 +37,7 @@ NUMBERS = (
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
     ("joint", "jnt_range", "limits", MAX_TURN), ("joint", "qpos0", "reference", TURNS),
     ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", 1e9),
-    ("coupling", "eq_data", "coefficients", TURNS),
+    ("site", "site_pos", "place", MAX_LENGTH), ("coupling", "eq_data", "coefficients", TURNS),
 )
 """Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
 masses, which MuJoCo derives from them where a file states none."""
@@ -200,7 +200,8 @@ def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
         return f"the coupling of joint '{model.joint(first).name}'" if of_joint else f"the tie number {index}"
     if kind == "vertex":
         return f"mesh '{model.mesh(int(np.searchsorted(model.mesh_vertadr, index, 'right')) - 1).name}'"
-    return f"{kind} '{(model.body if kind == 'link' else model.joint)(index).name}'"
+    named = {"link": model.body, "site": model.site, "joint": model.joint}[kind]
+    return f"{kind} '{named(index).name}'"
 
 
 def _told(values: Float[np.ndarray, " n"]) -> str:

@@ -327,7 +327,7 @@ def couple_closed_loops(
 
     Passive joints lead nothing: what ties leave free of them stays as it is.
     """
-    if not any(e.active and not is_linear(e) for e in spec.equalities):
+    if not spec.joints or not any(e.active and not is_linear(e) for e in spec.equalities):
         return
     linkage, ties = Linkage(spec, path), [e for e in spec.equalities if e.active]
     for group in linkage.groups():

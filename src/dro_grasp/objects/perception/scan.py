@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
@@ -16,9 +17,18 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, dropped_note, estimate_normals, table_note
+from dro_grasp.objects.loading import (
+    check_scale,
+    check_view,
+    cloud_object,
+    dropped_note,
+    estimate_normals,
+    given_normals,
+    table_note,
+)
 from dro_grasp.objects.perception.completion import complete_cloud
-from dro_grasp.objects.reading import in_rows, numbers, read_points, returned
+from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
@@ -28,6 +38,7 @@ RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
 FAR_DEPTH = 2.0  # Largest median depth of an image of things to grasp [m] (ours)
+FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
 
@@ -114,7 +125,9 @@ def load_scan(
 ) -> ObjectModel:
     """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
     check_scale(scale)
-    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
+    rows = read_rows(path)
+    rows[:, :3] *= scale
+    return scanned_object(path.stem, rows, T_frame_camera, keep_table=keep_table)
 
 
 @checked
@@ -128,7 +141,8 @@ def scanned_object(
 
     Args:
         name: What to call the object.
-        points: Points in the camera's frame, (n, 3) or (h, w, 3) [m]; NaN and (0, 0, 0) are dropped.
+        points: Points in the camera's frame, (n, 3) or (h, w, 3) [m]; NaN and (0, 0, 0) are dropped. With normals (n, 6), those
+            are used if they are unit vectors towards the camera.
         T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
             `table` are given; the camera's own frame by default.
         denoise: Drop outliers.
@@ -141,26 +155,11 @@ def scanned_object(
         OptionError: The pose is no rigid motion.
     """
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
-    kept = given_points(points, name)
-    there, camera = returned(kept), np.zeros(3)
-    dropped = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
-    kept = kept[there]
-    kept = kept[distinct_points(kept)]
-    total, table = len(kept), None if keep_table else table_plane(kept, camera)
-    if table is not None:
-        kept = kept[above_plane(kept, table)]
-    cut = total - len(kept)
-    if len(kept) > CLOUD_POINTS:
-        kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
-    if denoise and len(kept) > NEIGHBOURS:
-        kept = without_outliers(kept)
-    if len(kept) < NEIGHBOURS:
-        raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
-    check_extent(kept, name)
-    if float((kept @ kept.mean(0)).min()) <= 0:
-        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
-                          "camera's frame")
-    normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
+    clean = _cleaned(given_points(points, name), name, denoise, keep_table)
+    kept, table, camera = clean.rows[:, :3], clean.table, np.zeros(3)
+    normals, odd = facing_normals(clean.rows, name)
+    if normals is None:
+        normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
     if complete:
         up = None if T is None else T[2, :3]
@@ -171,16 +170,67 @@ def scanned_object(
         table = None if table is None else moved_plane(table, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
-    cut_off = () if table is None else (table_note(table, cut, total),)
-    return replace(obj, table=table, notes=(*obj.notes, *dropped, *cut_off))
+    cut_off = () if table is None else (table_note(table, clean.cut, clean.total),)
+    return replace(obj, table=table, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
 
 
-def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
-    """The points of a cloud, NaN included [m]; an ObjectError if they are none."""
+class Cleaned(NamedTuple):
+    """What is the object's of a camera's points."""
+
+    rows: Float[np.ndarray, "n columns"]  # Points [m], and normals if there are any
+    table: Float[np.ndarray, "4"] | None  # The table that was cut off: its normal and its height [m]
+    cut: int  # Points that went with it
+    total: int  # Points before
+    notes: tuple[str, ...]  # What to say of the others
+
+
+def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, keep_table: bool) -> Cleaned:
+    """The points that are the object's; an ObjectError if they are none."""
+    there, camera = returned(rows[:, :3]), np.zeros(3)
+    told = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
+    rows = rows[there]
+    rows = rows[distinct_points(rows[:, :3])]
+    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
+    if table is not None:
+        rows = rows[above_plane(rows[:, :3], table)]
+    cut = total - len(rows)
+    if not keep_table:
+        own, apart = one_thing(rows[:, :3], table is not None, name)
+        rows, told = rows[own], (*told, *apart)
+    if len(rows) > CLOUD_POINTS:
+        rows = rows[np.random.default_rng(0).permutation(len(rows))[:CLOUD_POINTS]]
+    if denoise and len(rows) > NEIGHBOURS:
+        rows = rows[ordinary(rows[:, :3])]
+    if len(rows) < NEIGHBOURS:
+        raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
+    check_view(rows[:, :3], name)
+    if float((rows[:, :3] @ rows[:, :3].mean(0)).min()) <= 0:
+        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
+                          "camera's frame")
+    return Cleaned(rows, table, cut, total, told)
+
+
+def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n columns"]:
+    """The points of a cloud, NaN included [m], and normals if there are any; an ObjectError if they are none."""
     array = in_rows(numbers(points, origin).astype(np.float64))
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points, or (n, 6) with normals")
     return array
+
+
+def facing_normals(
+    rows: Float[np.ndarray, "n columns"], origin: str
+) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
+    """Given normals, turned to the camera at the origin; None to estimate them. And what to say."""
+    normals, odd = given_normals(rows[:, :3], rows[:, 3:], origin, named=True)
+    if normals is None:
+        return None, odd
+    facing = float(((rows[:, :3] * normals).sum(1) < 0).mean())
+    if max(facing, 1 - facing) < FACING:
+        return None, ("its normals do not all face the camera, so they were not used",)
+    if facing < 0.5:
+        return -normals, ("its normals pointed away from the camera and were turned",)
+    return normals, odd
 
 
 def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
@@ -192,6 +242,11 @@ def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
+    """The points that are no outliers."""
+    return points[ordinary(points)]
+
+
+def ordinary(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Points whose mean distance to their neighbours is not unusually large. Source: Rusu et al. 2008."""
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
-    return points[distance <= distance.mean() + 2.5 * distance.std()]  # (ours)
+    return distance <= distance.mean() + 2.5 * distance.std()  # (ours)
