@@ -179,6 +179,7 @@ AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers c
 MOST_UNSURE = 6  # Most fingers that bend as far back as forth of which all combinations of sides are tried (ours)
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
+CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
 DECIDES = 0.3
 """Share of a finger's part in how much nearer fingertips come to each other from which on it tells where it closes (ours)."""
 NEARER = 1e-4  # Least amount of that, a sum of squared distances [m^2] (ours): one centimetre
@@ -204,6 +205,7 @@ class ClosingFinder:
     rest: Joints  # as in `Hand`
     movable: JointMask  # as in `Hand`
     stated: Joints  # the open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing
+    stated_ways: Joints  # +1 for joints that close by increasing, as it states, -1 for others, 0 if it says nothing
     fingers: tuple[Finger, ...]
     coarse: LinkSurface  # some samples of every link from the palm on
     on_palm: Bool[np.ndarray, " n"]  # the samples on the palm
@@ -226,10 +228,10 @@ class ClosingFinder:
         abduction = (found.abduction | other.sideways) & self.movable
         cut = tree.moves[self.motion.links][folded].any(0) & other.bending(abduction)
         straight = self.motion.straightest(self.start, cut)
-        knuckles, middle = self.motion.knuckle_joints(cut), (tree.lower + tree.upper) / 2
-        opening = found.opening_signs
-        half = dataclasses.replace(tree, lower=torch.where(opening > 0, middle.minimum(self.start), tree.lower),
-                                   upper=torch.where(opening < 0, middle.maximum(self.start), tree.upper))
+        knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
+        room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
+        half = dataclasses.replace(tree, lower=torch.where(opening > 0, tree.lower + room, tree.lower),
+                                   upper=torch.where(opening < 0, tree.upper - room, tree.upper))
         axis = Line(_tensor(found.palm.centre), _tensor(found.palm.direction))
         start = torch.where(knuckles, straight.clamp(half.lower, half.upper), straight)
         widest = dataclasses.replace(self.motion, tree=half).widest(axis, start, knuckles)
@@ -349,7 +351,8 @@ class ClosingFinder:
         jaw, other = (self.fixed_jaw(self.opened(way), way, abduction) for way in (signs, -signs))
         signs = signs if other is None or (jaw and jaw.length >= other.length) else -signs
         # A joint whose stated open posture is a limit opens towards it.
-        return torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
+        signs = torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
+        return torch.where(self.stated_ways == 0, signs, -self.stated_ways)
 
     def signs_from(self, widest: Joints, signs: Joints, abduction: JointMask, centre: Point) -> Joints:
         """Opening signs of joints that start from the widest posture: those that close each fingertip on the grasp centre."""
@@ -395,7 +398,8 @@ class ClosingFinder:
         Fingers that bend as far back as forth close to where fingertips meet.
         """
         straight, curls = self.straight, self.motion.curls(self.straight, self.movable & ~self.sideways)
-        sides = [float(curl.back < ONE_WAY) for curl in curls]
+        said = [float((curl.ways * self.stated_ways).sum()) for curl in curls]
+        sides = [math.copysign(1.0, way) if way else float(curl.back < ONE_WAY) for way, curl in zip(said, curls, strict=True)]
         unsure = [i for i, curl in enumerate(curls) if not sides[i] and bool(curl.ways.any())]
         if not 0 < len(unsure) <= MOST_UNSURE:
             return curls, sides
@@ -434,7 +438,8 @@ class ClosingFinder:
         """Joints that only spread fingers: their axes point out of the palm, at rest and with bent fingers alike."""
         bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
         direction = _tensor(palm.direction)
-        return (axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)) | self.sideways
+        along = axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)
+        return along | self.sideways | self.motion.spreading(self.straight, self.sides[0], self.movable, direction)
 
     def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
         """The palm at the closing where palm and fingers enclose a ball best."""

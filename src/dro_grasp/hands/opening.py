@@ -44,6 +44,7 @@ nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has
 ONE_WAY = 0.6
 """Share of how far it bends to one side, below which how far a finger bends to the other tells that it closes to the first
 (ours). Of 16 hands, all fingers but LEAP's thumb (0.71), Shadow's (0.6) and D'Claw's have 0.4 at most."""
+WIDEST_SPREAD = 1.6  # Range below which a joint may spread a finger, where its axis is not along the palm's [rad] (ours)
 LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
 IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
 CURLED = 0.95  # Share of its longest reach below which a finger is not straight (ours)
@@ -158,6 +159,19 @@ class FingerMotion:
         tips = self.tips(straight + shares * (closed - straight))
         apart = (tips[..., :, None, :] - tips[..., None, :, :]).square().sum(-1)
         return (apart[0] - apart.amin(0)).sum((-2, -1))
+
+    def spreading(self, straight: Joints, curls: list[Curl], moved: JointMask, palm_direction: Point) -> JointMask:
+        """Joints before a finger's hinges that move its tip a little across the way in which it curls, and not to the palm."""
+        velocity, found = self.velocities(straight), torch.zeros_like(moved)
+        small = moved & (self.tree.joint_unit == 1) & (self.tree.upper - self.tree.lower < WIDEST_SPREAD)
+        for row, (finger, curl) in enumerate(zip(self.fingers, curls, strict=True)):
+            hinge = next((i for i, link in enumerate(finger.chain) if bool((self.tree.link_coupling[link] * curl.ways).any())), 0)
+            before = (self.tree.link_coupling[list(finger.chain[:hinge])] != 0).any(0) & (curl.ways == 0)
+            ways = torch.nn.functional.normalize(velocity[row], dim=0)
+            closing = torch.nn.functional.normalize(velocity[row] @ curl.ways, dim=0)
+            across = (torch.stack([closing, palm_direction]) @ ways).abs().amax(0) < ACROSS
+            found |= small & before & across & (velocity[row].norm(dim=0) > STILL)
+        return found
 
     def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
         """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
@@ -279,10 +293,10 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes if (guess := _guessed_side(hand)) is None else [*notes, guess]
+    return notes
 
 
-def _guessed_side(hand: Hand) -> Note | None:
+def guessed_side(hand: Hand) -> Note | None:
     """A flat hand whose limits do not tell its palm's side: its fingers, but for a thumb, bend as far back as forth."""
     stated = hand.tree if hand.description is None else hand.description.tree
     beyond = torch.where(hand.opening_signs > 0, stated.upper - hand.open_ends, hand.open_ends - stated.lower)
@@ -292,7 +306,8 @@ def _guessed_side(hand: Hand) -> Note | None:
     if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
         return None
     return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is "
-                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
+                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side, or "
+                "a closed posture")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:
