@@ -49,8 +49,9 @@ NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, 
                     "axes and limits of its joints")
 """Error message."""
 LARGEST_BALL = 0.05  # Radius beyond which a larger empty ball is no better [m] (ours)
-NEARLY_CLOSED = (0.79, 0.8)
-"""Shares of the way from open to closed between which the jaw is looked for (ours). Closed all the way, jaws often overlap."""
+NEARLY_CLOSED = ((0.79, 0.8), (0.34, 0.35))
+"""Shares of the way from open to closed between which the jaw is looked for (ours). Closed all the way, jaws often overlap, and
+a finger of several joints curls past the jaw."""
 SLIDING = 0.1  # Difference in speed along a finger, as a share of its mean, below which it slides rather than turns (ours)
 KNUCKLE = 0.25  # Share of the finger beside which the jaw has not begun (ours)
 LEAST_LENGTH = 0.3  # Length of a jaw, as a share of the finger's, below which the palm has none (ours)
@@ -152,8 +153,12 @@ def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     """The part of the palm that a hand's single finger closes on; None of several fingers."""
     if len(hand.fingers) > 1:
         return None
-    before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in NEARLY_CLOSED)
-    return find_fixed_jaw(before, after, *((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)))
+    parts = [(hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)]
+    for shares in NEARLY_CLOSED[: 1 + (len(hand.fingers[0].chain) > 1)]:
+        before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in shares)
+        if (jaw := find_fixed_jaw(before, after, *parts)) is not None:
+            return jaw
+    return None
 
 
 def _faster(points: Float[np.ndarray, "m 3"], speed: Float[np.ndarray, " m"]) -> Place | None:
@@ -177,6 +182,8 @@ ALL_ROLLED_UP = 0.5
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
 AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
 MOST_UNSURE = 6  # Most fingers that bend as far back as forth of which all combinations of sides are tried (ours)
+FACING = 0.8
+"""Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Palms of 16 hands: 0.86 to 1."""
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
 CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
@@ -451,11 +458,11 @@ class ClosingFinder:
         best = max((find_palm(*part) for part in parts), key=lambda palm: palm.score)
         if jaw is not None:
             return dataclasses.replace(best, direction=jaw.direction)
-        if self.sweep is None or best.direction @ self.sweep > AHEAD:
+        if self.sweep is None or best.direction @ self.sweep > FACING:
             return best
         with contextlib.suppress(HandError):
-            return max((find_palm(*part, self.sweep) for part in parts), key=lambda palm: palm.score)
-        return best
+            best = max((find_palm(*part, self.sweep) for part in parts), key=lambda palm: palm.score)
+        return best if best.direction @ self.sweep > FACING else dataclasses.replace(best, direction=self.sweep)
 
     @cached_property
     def on_fingers(self) -> list[Bool[np.ndarray, " n"]]:
@@ -466,9 +473,12 @@ class ClosingFinder:
         """The part of the palm that a single finger closes on; None for several fingers."""
         if len(self.fingers) > 1:
             return None
-        postures = (self.posture(opened, signs, abduction, share) for share in NEARLY_CLOSED)
-        before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
-        return find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])
+        for shares in NEARLY_CLOSED[: 1 + (len(self.fingers[0].chain) > 1)]:
+            postures = (self.posture(opened, signs, abduction, share) for share in shares)
+            before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
+            if (jaw := find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])) is not None:
+                return jaw
+        return None
 
     def opened(self, signs: Joints) -> Joints:
         """The stated open posture; for other joints the limits towards which they open."""

@@ -35,11 +35,12 @@ def palm_cues(hand: Hand, description: Description) -> list[Cue]:
     curls, sides = finder.sides
     told = [bool(side) for curl, side in zip(curls, sides, strict=True) if bool(curl.ways.any())]
     tips = motion.tips(torch.stack([hand.canonical_joints(1 - float(x)) for x in torch.linspace(0, 1, SHARES)]))
-    apart = (tips - hand.grasp_centre_wrist).norm(dim=-1)
-    coming = (apart[0] - apart.amin(0) > NEARER).float()
+    targets = torch.cat([tips, hand.grasp_centre_wrist.expand(SHARES, 1, 3)], 1)
+    apart = (tips[:, :, None] - targets[:, None]).norm(dim=-1)
+    coming = (apart[0] - apart.amin(0) > NEARER).any(-1).float()
     ahead = ((tips[SHARES // 2] - hand.palm_centre_wrist) @ hand.palm_direction_wrist > -BEFORE).float()
     cues = [Cue(sum(told) / len(told) if told else 1.0, "neither limits nor other fingers tell to which side fingers close"),
-            Cue(float(coming.mean()), "fingers do not come nearer to the middle of what the hand encloses"),
+            Cue(float(coming.mean()), "fingers come nearer neither to each other nor to the middle of what the hand encloses"),
             Cue(float(ahead.mean()), "fingertips of the half-closed hand are behind the palm")]
     if finder.sweep is not None:
         along = float(hand.palm_direction_wrist @ torch.from_numpy(finder.sweep).float())
@@ -47,32 +48,34 @@ def palm_cues(hand: Hand, description: Description) -> list[Cue]:
     return cues
 
 
+def called_thumb(hand: Hand) -> int | None:
+    """The finger that is a thumb by its names."""
+    return named_thumb([[hand.tree.link_names[link] for link in finger.links] for finger in hand.fingers])
+
+
 def thumb_confidence(hand: Hand) -> float:
-    """How clearly one finger opposes the others; 1 where names say the same, or where there is no thumb."""
-    if hand.thumb is None or len(hand.fingers) < FEWEST_WITH_THUMB:
+    """How clearly one finger opposes the others, up to 1; 1 where names say the same, or where there is no thumb."""
+    if hand.thumb is None or len(hand.fingers) < FEWEST_WITH_THUMB or called_thumb(hand) == hand.thumb:
         return 1.0
-    named = named_thumb([[hand.tree.link_names[link] for link in finger.links] for finger in hand.fingers])
-    if named is not None:
-        return float(named == hand.thumb)
     first, second = hand.thumb_opposition.topk(2).values.tolist()
     return min(1.0, max(0.0, first - second) / ABOUT_AS_OPPOSED)
 
 
 def confidence(hand: Hand, description: Description) -> tuple[dict[str, float], list[Note]]:
     """How sure palm and thumb are, from 0 to 1, and a note on each that is not."""
-    least = min(palm_cues(hand, description), key=lambda cue: cue.share)
-    guess, palm = guessed_side(hand), hand.tree.link_names[hand.palm]
+    cues, palm = palm_cues(hand, description), hand.tree.link_names[hand.palm]
+    least, guess = min(cues, key=lambda cue: cue.share), guessed_side(hand) if cues[0].share < 1 else None
     sure = {"palm": round(min(least.share, GUESS if guess else 1.0), 2), "thumb": round(thumb_confidence(hand), 2)}
     notes = [guess] if guess else []
     if not guess and least.share < LOW:
         notes.append(Note("warning", palm, f"has a palm direction of low confidence ({sure['palm']:g}): {least.doubt}. See the "
                           f"picture; if the arrow is wrong, state where joints close: {entry(description)}"))
-    if hand.thumb is not None and sure["thumb"] < LOW:
-        tip = hand.tree.link_names[hand.tips[hand.thumb]]
-        named = sure["thumb"] == 0 and named_thumb([[hand.tree.link_names[i] for i in f.links] for f in hand.fingers]) is not None
-        notes.append(Note("warning" if named else "info", tip, "is taken for the thumb with low confidence: "
-                          + ("another finger is called so, but opposes less" if named else "another one opposes about as much")
-                          + ". A link called thumb decides among such"))
+    tip = None if hand.thumb is None else hand.tree.link_names[hand.tips[hand.thumb]]
+    if tip is not None and called_thumb(hand) not in (None, hand.thumb):
+        notes.append(Note("warning", tip, "is taken for the thumb, as it opposes the others, and another finger is called so"))
+    elif tip is not None and sure["thumb"] < LOW:
+        notes.append(Note("info", tip, f"is taken for the thumb with low confidence ({sure['thumb']:g}): another finger opposes "
+                          "about as much. One of them whose links are called thumb would be it"))
     return sure, notes
 
 

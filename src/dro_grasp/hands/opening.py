@@ -44,6 +44,7 @@ nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has
 ONE_WAY = 0.6
 """Share of how far it bends to one side, below which how far a finger bends to the other tells that it closes to the first
 (ours). Of 16 hands, all fingers but LEAP's thumb (0.71), Shadow's (0.6) and D'Claw's have 0.4 at most."""
+TO_PALM = 0.5  # Cosine up to which such a joint does not move it to the palm (ours)
 WIDEST_SPREAD = 1.6  # Range below which a joint may spread a finger, where its axis is not along the palm's [rad] (ours)
 LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
 IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
@@ -161,16 +162,15 @@ class FingerMotion:
         return (apart[0] - apart.amin(0)).sum((-2, -1))
 
     def spreading(self, straight: Joints, curls: list[Curl], moved: JointMask, palm_direction: Point) -> JointMask:
-        """Joints before a finger's hinges that move its tip a little across the way in which it curls, and not to the palm."""
+        """Joints that move a straight finger's tip a little across the way in which it curls, and not to the palm."""
         velocity, found = self.velocities(straight), torch.zeros_like(moved)
         small = moved & (self.tree.joint_unit == 1) & (self.tree.upper - self.tree.lower < WIDEST_SPREAD)
         for row, (finger, curl) in enumerate(zip(self.fingers, curls, strict=True)):
-            hinge = next((i for i, link in enumerate(finger.chain) if bool((self.tree.link_coupling[link] * curl.ways).any())), 0)
-            before = (self.tree.link_coupling[list(finger.chain[:hinge])] != 0).any(0) & (curl.ways == 0)
+            others = self.tree.moves[finger.tip] & (curl.ways == 0)
             ways = torch.nn.functional.normalize(velocity[row], dim=0)
             closing = torch.nn.functional.normalize(velocity[row] @ curl.ways, dim=0)
-            across = (torch.stack([closing, palm_direction]) @ ways).abs().amax(0) < ACROSS
-            found |= small & before & across & (velocity[row].norm(dim=0) > STILL)
+            across = ((closing @ ways).abs() < ACROSS) & ((palm_direction @ ways).abs() < TO_PALM)
+            found |= small & others & across & (velocity[row].norm(dim=0) > STILL)
         return found
 
     def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
