@@ -154,13 +154,11 @@ def measure_opposition(
 def find_thumb(opposition: Float[Tensor, " n_tips"], named: int | None = None) -> int | None:
     """The finger with the largest thumb opposition, or the one that is named so if it has about as much.
 
-    Hands with few fingers have none, but for the one of three that is named so and opposes the others.
+    None for hands with too few fingers to have a thumb.
     """
-    most = int(opposition.argmax())
     if len(opposition) < FEWEST_WITH_THUMB:
-        second = float(opposition.sort(descending=True).values[1:2].sum())
-        alone = len(opposition) > 2 and float(opposition[most]) - second > ABOUT_AS_OPPOSED
-        return most if alone and most == named else None
+        return None
+    most = int(opposition.argmax())
     return most if named is None or float(opposition[most] - opposition[named]) > ABOUT_AS_OPPOSED else named
 
 

@@ -183,7 +183,7 @@ fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some fi
 AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
 MOST_UNSURE = 6  # Most fingers that bend as far back as forth of which all combinations of sides are tried (ours)
 FACING = 0.8
-"""Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Palms of 16 hands: 0.86 to 1."""
+"""Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Of 16 hands: 0.86 to 1."""
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
 CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
@@ -234,7 +234,7 @@ class ClosingFinder:
         other, tree = self.spreading(found), self.tree
         abduction = (found.abduction | other.sideways) & self.movable
         cut = tree.moves[self.motion.links][folded].any(0) & other.bending(abduction)
-        straight = self.motion.straightest(self.start, cut)
+        straight = torch.where(cut, self.straight, self.start)
         knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
         room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
         half = dataclasses.replace(tree, lower=torch.where(opening > 0, tree.lower + room, tree.lower),
@@ -396,7 +396,9 @@ class ClosingFinder:
     @cached_property
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
-        return self.motion.straightest(self.start, self.movable & ~self.sideways & self.stated.isnan())
+        middle = torch.where(self.movable & self.stated.isnan(), (self.tree.lower + self.tree.upper) / 2, self.start)
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        return self.motion.straightest(self.motion.straightest(middle, bends), bends)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:

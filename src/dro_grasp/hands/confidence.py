@@ -1,4 +1,4 @@
-"""How sure palm and thumb of a hand are: cues that do not know of each other should agree. `hand check` tells where they do not."""
+"""How sure palm and thumb of a hand are: whether cues that do not know of each other agree."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def confidence(hand: Hand, description: Description) -> tuple[dict[str, float], 
     if tip is not None and called_thumb(hand) not in (None, hand.thumb):
         notes.append(Note("warning", tip, "is taken for the thumb, as it opposes the others, and another finger is called so"))
     elif tip is not None and sure["thumb"] < LOW:
-        notes.append(Note("info", tip, f"is taken for the thumb with low confidence ({sure['thumb']:g}): another finger opposes "
-                          "about as much. One of them whose links are called thumb would be it"))
+        notes.append(Note("info", tip, f"is taken for the thumb with low confidence ({sure['thumb']:g}): another finger "
+                          "opposes about as much. One of them whose links are called thumb would be it"))
     return sure, notes
 
 

@@ -166,7 +166,7 @@ class FingerMotion:
         velocity, found = self.velocities(straight), torch.zeros_like(moved)
         small = moved & (self.tree.joint_unit == 1) & (self.tree.upper - self.tree.lower < WIDEST_SPREAD)
         for row, (finger, curl) in enumerate(zip(self.fingers, curls, strict=True)):
-            others = self.tree.moves[finger.tip] & (curl.ways == 0)
+            others = self.tree.moves[finger.tip] & (curl.ways == 0) & bool(curl.ways.any())
             ways = torch.nn.functional.normalize(velocity[row], dim=0)
             closing = torch.nn.functional.normalize(velocity[row] @ curl.ways, dim=0)
             across = ((closing @ ways).abs() < ACROSS) & ((palm_direction @ ways).abs() < TO_PALM)
@@ -237,8 +237,10 @@ class FingerMotion:
         return q
 
     def knuckle_joints(self, bends: JointMask) -> JointMask:
-        """The joints that move the knuckles' links: beyond them, fingers are straight or bent."""
-        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends
+        """The joints that move the knuckles' links, and none beyond them, where fingers are straight or bent."""
+        knuckles = [self._knuckle(finger, bends) for finger in self.fingers]
+        beyond = [link for finger, first in zip(self.fingers, knuckles, strict=True) for link in finger.chain if link > first]
+        return self.tree.moves[knuckles].any(0) & bends & ~(self.tree.link_coupling[beyond] != 0).any(0)
 
     def folded(
         self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line, both_ways: Bool[Tensor, " n_tips"]
@@ -306,8 +308,8 @@ def guessed_side(hand: Hand) -> Note | None:
     if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
         return None
     return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is "
-                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side, or "
-                "a closed posture")
+                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side, "
+                "or a closed posture")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:
