@@ -186,6 +186,7 @@ FACING = 0.8
 """Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Of 16 hands: 0.86 to 1."""
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
+EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
 CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
 DECIDES = 0.3
 """Share of a finger's part in how much nearer fingertips come to each other from which on it tells where it closes (ours)."""
@@ -396,9 +397,7 @@ class ClosingFinder:
     @cached_property
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
-        middle = torch.where(self.movable & self.stated.isnan(), (self.tree.lower + self.tree.upper) / 2, self.start)
-        bends = self.movable & ~self.sideways & self.stated.isnan()
-        return self.motion.straightest(self.motion.straightest(middle, bends), bends)
+        return self.motion.straightest(self.start, self.movable & ~self.sideways & self.stated.isnan(), EXACT)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:

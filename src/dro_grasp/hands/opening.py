@@ -213,12 +213,13 @@ class FingerMotion:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
 
-    def straightest(self, start: Joints, bends: JointMask) -> Joints:
+    def straightest(self, start: Joints, bends: JointMask, same: float = SAME_SPAN) -> Joints:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
-        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends, same)
 
     def _best(
-        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask
+        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask,
+        same: float = SAME_SPAN,
     ) -> Joints:
         """The posture that measures most, found joint by joint."""
         q, tree = start, self.tree
@@ -231,7 +232,7 @@ class FingerMotion:
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
                 total = measure(tried)
-                q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
+                q = tried[int((total > total.max() - same).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
