@@ -199,6 +199,7 @@ LOOSE = 0.03
 some linkages only about. Of five grippers it is 0.014 at most; jaws that turn against each other about near axes have 0.09."""
 TURN = 0.1  # Least angle that two links turn about their pin [rad] (ours); with none, any point would do
 APART = 3e-3  # Least distance of a pin from the axes of the two links' own joints [m] (ours)
+IN_PLACE = 2e-3  # Speed of its middle below which a last link turns in place [m/rad or m/m] (ours)
 OUTSIDE = 5e-3  # Largest distance of a pin from the bounding boxes of both links [m] (ours)
 
 
@@ -241,6 +242,19 @@ def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkG
                 rod, finger = (first, second) if reach[0] < reach[1] else (second, first)
                 pinned[rod.tip] = finger.tip
     return {rod: _last(pinned, rod) for rod in pinned}
+
+
+def turn_in_place(tree: KinematicTree, ends: Sequence[int], geometry: Sequence[LinkGeometry]) -> set[int]:
+    """Ends whose middle no joint moves, as rotors of motors within a palm; none if fewer than two others would be left."""
+    places = []
+    for end in ends:
+        corners = np.concatenate([shape.vertices for shape in geometry if shape.link == end])
+        places.append((corners.min(0) + corners.max(0)) / 2)
+    poses, links = tree.forward((tree.lower + tree.upper) / 2), torch.tensor(ends)
+    points = se3.apply(poses[links], torch.from_numpy(np.stack(places)).float())
+    speed = tree.point_jacobian(poses, points, links).norm(dim=1).amax(1)
+    found = {end for end, moved in zip(ends, speed.tolist(), strict=True) if moved < IN_PLACE}
+    return found if len(ends) - len(found) > 1 else set()
 
 
 def _end(tree: KinematicTree, tip: int, poses: Float[np.ndarray, "n_links 4 4"], geometry: Sequence[LinkGeometry]) -> _End:

@@ -17,6 +17,7 @@ from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.closing import fixed_jaw_of
+from dro_grasp.hands.confidence import LOW, confidence, thumb_confidence
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.effort import effort_notes, find_efforts
@@ -31,6 +32,7 @@ TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
            "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
+DOUBT = (200, 20, 20)  # Colour of what a picture says of low confidence
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
 FEWEST_WITH_SIDE = 3  # Hands with fewer fingers are on no side, whatever they are called (ours)
@@ -88,7 +90,8 @@ def check_hand(name: str | Path) -> HandReport:
     hand = build_hand(description, name=label)
     found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *_side_notes(hand),
              *opening_notes(hand), *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
-    return HandReport(hand, _facts(hand, description), (*description.notes, *found))
+    sure, doubts = confidence(hand, description)
+    return HandReport(hand, {**_facts(hand, description), "confidence": sure}, (*description.notes, *found, *doubts))
 
 
 def _facts(hand: Hand, description: Description) -> dict[str, Any]:
@@ -144,7 +147,7 @@ def hand_side(hand: Hand) -> str:
 
 def seen_side(hand: Hand) -> str | None:
     """The side that the thumb is on; None for a hand without a thumb or with fingers all around the palm."""
-    if hand.thumb is None:
+    if hand.thumb is None or thumb_confidence(hand) < LOW:
         return None
     tips, palm = FingerMotion.of(hand).tips(hand.canonical_joints(1.0)), hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
@@ -245,8 +248,16 @@ def picture(hand: Hand, path: Path | str) -> None:
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)
+    if doubts := _doubts(hand):
+        pen.text((width + 220, 6), f"low confidence: {doubts}", fill=DOUBT, font=font)
     with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
+
+
+def _doubts(hand: Hand) -> str:
+    """What of the hand is read with low confidence, in words."""
+    sure, _ = confidence(hand, hand.description) if hand.description else ({}, [])
+    return " and ".join({"palm": "palm direction"}.get(name, name) for name, value in sure.items() if value < LOW)
 
 
 def _camera(hand: Hand) -> Camera:

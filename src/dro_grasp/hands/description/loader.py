@@ -33,7 +33,7 @@ from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
-OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use it)
+OPEN, CLOSED = "open", "closed"  # Names of the states or keyframes (ours; MoveIt's own examples use the first)
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
@@ -52,8 +52,8 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
             (arm_in_urdf if arm else part_of_urdf)(root, link, path)
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
-        stated = open_state(srdf) if os.path.isfile(srdf) else {}
-        files = (*files, srdf) if stated else files
+        states = [read_state(srdf, name) if os.path.isfile(srdf) else {} for name in (OPEN, CLOSED)]
+        files = (*files, srdf) if any(states) else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
         if link is not None and arm:
@@ -61,7 +61,7 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
         elif link is not None:
             spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
-            stated = open_key(spec)
+            states = [read_key(spec, name) for name in (OPEN, CLOSED)]
         spec = spec if link is not None else with_palm_of_world(spec, path, notes)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
@@ -72,7 +72,7 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
     if not arm:
         model = lightened(spec, model, path, notes)
     tree = read_tree(model, path, notes)
-    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
+    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), *states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +88,8 @@ class Description:
     notes: tuple[Note, ...]  # findings and repairs
     open_posture: Mapping[str, float]
     """The open posture that the file, or the SRDF beside it, states, by joint [rad or m]; empty if it states none."""
+    closed_posture: Mapping[str, float]
+    """Values towards which joints close, likewise."""
 
     @property
     def name(self) -> str:
@@ -229,25 +231,25 @@ def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
     return digest.hexdigest()
 
 
-def open_state(srdf: Path) -> dict[str, float]:
-    """Joints in every `<group_state name="open">` of an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
+def read_state(srdf: Path, name: str) -> dict[str, float]:
+    """Joints in every `<group_state>` of this name in an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
     stated = {}
     for state in parse_xml(srdf).iter("group_state"):
-        for joint in state.iter("joint") if state.get("name") == OPEN else ():
+        for joint in state.iter("joint") if state.get("name") == name else ():
             try:
                 stated[joint.get("name", "")] = float(joint.get("value", ""))
             except ValueError as error:
-                raise HandError(f"{srdf}: the state '{OPEN}' has value=\"{joint.get('value')}\" for joint "
+                raise HandError(f"{srdf}: the state '{name}' has value=\"{joint.get('value')}\" for joint "
                                 f"'{joint.get('name')}'; expected one number") from error
     return stated
 
 
-def open_key(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Joint values of the keyframe `open` of an MJCF [rad or m]; empty if it has none."""
-    if not any(key.name == OPEN for key in spec.keys):
+def read_key(spec: mujoco.MjSpec, name: str) -> dict[str, float]:
+    """Joint values of the keyframe of this name in an MJCF [rad or m]; empty if it has none."""
+    if not any(key.name == name for key in spec.keys):
         return {}
     model = spec.copy().compile()
-    values = model.key_qpos[model.key(OPEN).id]
+    values = model.key_qpos[model.key(name).id]
     single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
     joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
     return {model.joint(j).name: float(values[model.jnt_qposadr[j]]) for j in joints}
