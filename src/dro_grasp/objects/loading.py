@@ -257,8 +257,8 @@ def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0
     """Refuse clouds of implausible sizes, as `check_extent` does; those as large as a view may be one."""
     largest = float(np.ptp(points, axis=0).max())
     if LARGEST < largest <= FARTHEST_VIEW:
-        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in metres, "
-                          "cut out the object that is meant; if its unit is not the metre, give "
+        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in "
+                          "metres, cut out the object that is meant; if its unit is not the metre, give "
                           f"{_scale_hint(largest / scale, origin)}")
     check_extent(points, origin, scale)
 
