@@ -304,7 +304,7 @@ class _RobotFile:
         self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
         hand = str(values["hand"])
         file, link = split_part(str(path.parent / hand))
-        self.hand = named(file, link) if Path(file).is_file() else hand
+        self.hand = named(file, link) if given_path(file).is_file() else hand
         faults = self.faults = Faults(path)
         self.mount = faults.of(lambda: self._mount(values), {"faulty": True})
         self.T_link_wrist = faults.of(lambda: self.pose(self.mount, "mount", FARTHEST_MOUNT), np.eye(4))

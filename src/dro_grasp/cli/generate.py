@@ -144,7 +144,7 @@ class Generate:
         from dro_grasp.simulation.outcome import count_failures, next_steps
 
         begin = time.perf_counter()
-        with progress_bar(f"reading {name}", self.json):
+        with progress_bar(f"reading {Path(name).name}", self.json):
             obj = self._load(name, job.camera)
         seconds = {**job.seconds, "load": job.seconds["load"] + time.perf_counter() - begin}
         if self.only_successful and self._protocol(obj) == "none":

@@ -239,7 +239,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
             notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
 
 
-def _told_range(limits: Float[np.ndarray, "2"]) -> str:
+def _told_range(limits: Sequence[float] | Float[np.ndarray, "2"]) -> str:
     """Limits that a joint states but that do not count, in words; empty if it states none."""
     low, high = limits
     return "" if low == high == 0 else f"{low:g} to {high:g}" + ("" if low >= high else ", but limited is 'false'")

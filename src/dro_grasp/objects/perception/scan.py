@@ -55,7 +55,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     Raises:
         ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
-    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
+    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if image.ndim != 2:
         raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
     _check_intrinsics(matrix, *image.shape)
@@ -72,7 +72,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     _check_depths(float(np.median(image[valid])))
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
-    rays = np.linalg.solve(matrix.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
+    rays = np.linalg.solve(matrix, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
 
 
