@@ -232,9 +232,10 @@ class ClosingFinder:
 
     def unfolded(self, found: Closing, folded: Bool[Tensor, " n_tips"]) -> Closing:
         """The closing of a hand some of whose fingers fold back: these open straight, and at their knuckles the widest."""
-        other, tree = self.spreading(found), self.tree
+        tree, of_folded = self.tree, self.tree.moves[self.motion.links][folded].any(0)
+        other = dataclasses.replace(self, sideways=self.spreading(found).sideways & of_folded)
         abduction = (found.abduction | other.sideways) & self.movable
-        cut = tree.moves[self.motion.links][folded].any(0) & other.bending(abduction)
+        cut = of_folded & other.bending(abduction)
         straight = torch.where(cut, self.straight, self.start)
         knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
         room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
@@ -397,7 +398,8 @@ class ClosingFinder:
     @cached_property
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
-        return self.motion.straightest(self.start, self.movable & ~self.sideways & self.stated.isnan(), EXACT)
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT) if bool(bends.any()) else self.start
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:

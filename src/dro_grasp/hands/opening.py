@@ -239,9 +239,13 @@ class FingerMotion:
 
     def knuckle_joints(self, bends: JointMask) -> JointMask:
         """The joints that move the knuckles' links, and none beyond them, where fingers are straight or bent."""
-        knuckles = [self._knuckle(finger, bends) for finger in self.fingers]
-        beyond = [link for finger, first in zip(self.fingers, knuckles, strict=True) for link in finger.chain if link > first]
-        return self.tree.moves[knuckles].any(0) & bends & ~(self.tree.link_coupling[beyond] != 0).any(0)
+        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends & ~self.whole(bends)
+
+    def whole(self, bends: JointMask) -> JointMask:
+        """Joints that bend a finger at its knuckle and, by couplings, beyond it: where it reaches farthest, it is not open."""
+        firsts = [self._knuckle(finger, bends) for finger in self.fingers]
+        beyond = [link for finger, first in zip(self.fingers, firsts, strict=True) for link in finger.chain if link > first]
+        return (self.tree.link_coupling[firsts] != 0).any(0) & (self.tree.link_coupling[beyond] != 0).any(0)
 
     def folded(
         self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line, both_ways: Bool[Tensor, " n_tips"]

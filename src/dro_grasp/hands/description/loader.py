@@ -33,7 +33,8 @@ from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
-OPEN, CLOSED = "open", "closed"  # Names of the states or keyframes (ours; MoveIt's own examples use the first)
+OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use it)
+CLOSED = "closed"  # Name of the one towards which joints close (ours)
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
