@@ -42,10 +42,10 @@ def test_one_side_alone_is_asked_about(tmp_path: Path):
         for points, asked in ((whole, False), (whole[corner > 0.01], True)):
             np.save(tmp_path / "c.npy", points)
             notes = load_file(tmp_path / "c.npy").notes
-            assert any("--camera" in note for note in notes) == asked
+            assert any("camera=" in note for note in notes) == asked
     seen = ball[ball[:, 2] > 0]
     np.save(tmp_path / "c.npy", np.concatenate([seen, seen], 1))
-    assert not any("--camera" in note for note in load_file(tmp_path / "c.npy").notes), "its normals were given"
+    assert not any("camera=" in note for note in load_file(tmp_path / "c.npy").notes), "its normals were given"
 
 
 def test_given_normals_are_kept_and_not_scaled(tmp_path: Path):

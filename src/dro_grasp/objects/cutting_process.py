@@ -42,7 +42,8 @@ def _vhacd(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], op
     from vhacdx import compute_vhacd
 
     rows = np.column_stack([np.full(len(faces), 3), faces]).ravel().astype(np.uint32)  # as VTK writes polygons
-    return list(compute_vhacd(np.ascontiguousarray(vertices, np.float64), rows, **options))
+    parts = compute_vhacd(np.ascontiguousarray(vertices, np.float64), rows, **options)
+    return [(corners, triangles.astype(np.int32)) for corners, triangles in parts]
 
 
 if __name__ == "__main__":
