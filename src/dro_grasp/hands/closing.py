@@ -151,7 +151,7 @@ def find_fixed_jaw(before: Points, points: Points, on_palm: Mask, on_finger: Mas
 
 def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     """The part of the palm that a hand's single finger closes on; None of several fingers."""
-    if len(hand.fingers) > 1:
+    if len(hand.fingers) != 1:
         return None
     parts = [(hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)]
     for shares in NEARLY_CLOSED[: 1 + (len(hand.fingers[0].chain) > 1)]:
@@ -399,7 +399,9 @@ class ClosingFinder:
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
         bends = self.movable & ~self.sideways & self.stated.isnan()
-        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT) if bool(bends.any()) else self.start
+        if not bool(bends.any()):
+            return self.start
+        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:
@@ -474,7 +476,7 @@ class ClosingFinder:
 
     def fixed_jaw(self, opened: Joints, signs: Joints, abduction: JointMask) -> FixedJaw | None:
         """The part of the palm that a single finger closes on; None for several fingers."""
-        if len(self.fingers) > 1:
+        if len(self.fingers) != 1:
             return None
         for shares in NEARLY_CLOSED[: 1 + (len(self.fingers[0].chain) > 1)]:
             postures = (self.posture(opened, signs, abduction, share) for share in shares)
