@@ -100,8 +100,8 @@ def _cell(value: Any) -> str:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar on stderr; the block calls its value with (done, total), or gets None if quiet."""
-    if quiet:
+    """A progress bar on stderr, if that is a terminal; the block calls its value with (done, total), or gets None if quiet."""
+    if quiet or not stderr.is_interactive:
         yield None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

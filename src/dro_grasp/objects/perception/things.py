@@ -29,7 +29,7 @@ def one_thing(
         if on_table:
             raise ObjectError(
                 f"{origin} is a view of a table with {said}; cut out the one that is meant, for example the points within "
-                "10 cm of its middle, or keep all points as one object with --keep-table, keep_table=True in Python")
+                "10 cm of its middle, or keep all points as one object with keep_table=True")
         return every, (f"it is {said}, and all of them count as one object; of a view of a scene, cut out the one that is "
                        "meant",)
     if not on_table or not things or len(things[0]) == len(points):
