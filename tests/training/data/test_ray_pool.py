@@ -88,6 +88,15 @@ def test_an_address_where_nobody_listens_is_told_at_once():
             RayPool(Job(0, EngineConfig()), 1, 60.0, address)
 
 
+def test_a_script_that_cannot_be_imported_again_is_told(tmp_path):
+    pytest.importorskip("ray")
+    code = ("from dro_grasp.training.data.engine.pools import RayPool; from dro_grasp.training.data.engine.worker import *\n"
+            "RayPool(Job(0, EngineConfig()), 1, 60.0)")
+    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 1
+    assert "ClusterError: the process that joins the Ray cluster ended as it began; give it a script" in done.stderr
+
+
 def test_without_ray_the_engine_says_what_to_install(monkeypatch):
     from dro_grasp.training.data.engine.pools import RayPool
     from dro_grasp.training.data.engine.worker import EngineConfig

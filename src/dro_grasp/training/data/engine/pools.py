@@ -177,8 +177,11 @@ class RayPool:
         self.process = None if ray.is_initialized() else _one_process(_join_alone)
         try:
             self._ask(_join, job, workers, limit, address or os.environ.get("RAY_ADDRESS"), work)
-        except BaseException:
+        except BaseException as error:
             self._end()
+            if isinstance(error.__cause__, BrokenProcessPool):
+                raise ClusterError("the process that joins the Ray cluster ended as it began; give it a script that can be "
+                                   'imported, with its calls under `if __name__ == "__main__":`') from error
             raise
 
     @property
@@ -319,8 +322,9 @@ def _connect(address: str | None, workers: int) -> None:
         _knock(address)
         ray.init(address=address, **quiet)
     except (OSError, RuntimeError, ValueError) as error:
-        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
-                          "give the address that it prints") from error
+        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, "
+                          "give the address that it prints and, where Ray asks for one, the head's token "
+                          "(RAY_AUTH_TOKEN)") from error
 
 
 def _knock(address: str) -> None:
