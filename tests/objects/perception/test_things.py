@@ -40,7 +40,7 @@ def from_a_camera(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("camera", [False, True])
 def test_several_things_on_a_table_are_asked_about_with_their_places(count: int, camera: bool) -> None:
     read = (lambda p: scanned_object("view", *from_a_camera(p))) if camera else load_object
-    with pytest.raises(ObjectError, match=rf"a view of a table with {count} things that stand apart .*keep_table=True") as caught:
+    with pytest.raises(ObjectError, match=rf"a view of a table with {count} things .*keep_table=True") as caught:
         read(view(count))
     told = str(caught.value).partition("(")[2].partition(")")[0].split("; ")
     assert len(told) == count
