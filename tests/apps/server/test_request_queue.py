@@ -190,6 +190,20 @@ def test_a_queue_in_a_hurry_waits_no_longer() -> None:
     assert time.monotonic() - begin < 20
 
 
+def test_what_is_computed_when_the_process_is_killed_from_outside_is_computed_again() -> None:
+    queue = RequestQueue(None, answerer=QuickAnswerer)
+    running, waiting = submitted(queue, "running", "nap"), queue.submit(call("waiting"))
+    os.kill(queue.ready.process, signal.SIGKILL)
+    assert running.reply.result(20)[:2] == (200, b"running")
+    assert waiting.reply.result(20)[:2] == (200, b"waiting")
+    assert queue.metrics.starts == 2
+    fatal = queue.submit(call("fatal", "killed")).reply.result(30)
+    assert fatal.status == 500
+    assert b"the process died over this request" in fatal.body
+    assert queue.submit(call("next")).reply.result(20)[:2] == (200, b"next")
+    queue.close()
+
+
 def test_a_process_that_is_terminated_with_its_server_says_so() -> None:
     queue = RequestQueue(None, answerer=QuickAnswerer)
     running = submitted(queue, "running", "hang")

@@ -34,7 +34,7 @@ from dro_grasp.errors import HandError, OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.predictor import GraspPredictor
@@ -357,6 +357,25 @@ def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, m
         assert not set("<{[`") & set(text), text
         assert "**b" not in text
         assert "b**" not in text
+
+
+@pytest.mark.slow
+def test_a_browser_runs_nothing_that_a_grasp_file_states(tmp_path: Path) -> None:
+    """An image with `onerror`, and a frame, wherever a file has text that the page shows."""
+    attack = "<img src=nowhere onerror=\"window.hit=1\"><iframe srcdoc=\"<script>parent.hit=1</script>\"></iframe>"
+    hand, obj = load_hand("gripper3"), load_object("sphere")
+    T = torch.eye(4)[None]
+    T[0, :3, 3] = -hand.grasp_centre_wrist
+    GraspBatch.create(
+        hand, obj, T, hand.canonical_joints(0.6)[None], success=torch.tensor([False]), protocol=("strict/1",)).replace(
+        hand=attack, hand_sha256="a" * 64, object=(attack,), object_sha256=("b" * 64,),
+        extra={REASON: [attack], CONTACT_LINKS: [[attack]]}).save(tmp_path / "g.parquet")
+    with page_of(str(tmp_path / "g.parquet"), "--hand", "gripper3", "--object", "sphere", size=(1280, 860)) as page:
+        page.get_by_text("touched by").first.wait_for(timeout=120_000)
+        time.sleep(2)
+        assert page.evaluate("window.hit") is None
+        assert page.locator("iframe").count() == page.locator("img[src=nowhere]").count() == 0
+        assert "onerror=" in page.locator("body").inner_text()
 
 
 CAMERA = {

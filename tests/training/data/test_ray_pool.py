@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -167,7 +168,7 @@ def test_a_node_that_dies_below_its_driver_is_told_and_the_next_run_goes_on(tmp_
         killed_raylet(process, tmp_path, shards)
         told = process.communicate(timeout=200)
     assert process.returncode == 1
-    assert "error: the Ray node of this machine died" in told[1]
+    assert re.search("error: (the Ray node of this machine died|Ray could not start a node on this machine)", told[1])
     assert told[0] == ""
     made = len(find_shards(tmp_path / "data"))
     assert made >= shards

@@ -280,8 +280,11 @@ class RequestQueue:
         self.metrics.replies[int(reply.status)] += 1
         del self._known[request.call.id]
 
-    def _computed(self, request: Request) -> tuple[Reply, bool]:
-        """The reply to a request, and whether its process is still alive."""
+    def _computed(self, request: Request, again: bool = False) -> tuple[Reply, bool]:
+        """The reply to a request, and whether its process is still alive.
+
+        Where somebody else killed the process, or the system for want of memory, the request is computed once again.
+        """
         try:
             if not self._pool.active:
                 self._end()
@@ -298,6 +301,9 @@ class RequestQueue:
         except (ProcessExpired, BrokenProcessPool, RuntimeError, DroGraspError) as error:
             if self._stops(error):
                 return STOPPED, False
+            if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGKILL and not again:
+                self._end()
+                return self._computed(request, again=True)
             return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"the process died over this request ({type(error).__name__}: "
                                                              f"{error}); it starts anew"), False
 

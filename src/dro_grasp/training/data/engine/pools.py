@@ -316,7 +316,11 @@ def _connect(address: str | None, workers: int) -> None:
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
-        ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        try:
+            ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        except Exception as error:  # Ray raises that very class
+            raise ClusterError(f"Ray could not start a node on this machine ({str(error).partition('.')[0]}); try again when "
+                               "it is less busy, or use engine='local'") from error
         return
     try:
         _knock(address)
