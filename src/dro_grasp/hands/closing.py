@@ -399,7 +399,9 @@ class ClosingFinder:
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
         bends = self.movable & ~self.sideways & self.stated.isnan()
-        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT) if bool(bends.any()) else self.start
+        if not bool(bends.any()):
+            return self.start
+        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:
