@@ -154,7 +154,7 @@ def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     if len(hand.fingers) != 1:
         return None
     parts = [(hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)]
-    for shares in NEARLY_CLOSED[: 1 + (len(hand.fingers[0].chain) > 1)]:
+    for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in hand.fingers)]:
         before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in shares)
         if (jaw := find_fixed_jaw(before, after, *parts)) is not None:
             return jaw
@@ -451,7 +451,8 @@ class ClosingFinder:
         bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
         direction = _tensor(palm.direction)
         along = axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)
-        return along | self.sideways | self.motion.spreading(self.straight, self.sides[0], self.movable, direction)
+        spreading = self.motion.spreading(self.straight, self.sides[0], self.movable, direction, self.sweep)
+        return along | self.sideways | spreading
 
     def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
         """The palm at the closing where palm and fingers enclose a ball best."""
@@ -478,7 +479,7 @@ class ClosingFinder:
         """The part of the palm that a single finger closes on; None for several fingers."""
         if len(self.fingers) != 1:
             return None
-        for shares in NEARLY_CLOSED[: 1 + (len(self.fingers[0].chain) > 1)]:
+        for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in self.fingers)]:
             postures = (self.posture(opened, signs, abduction, share) for share in shares)
             before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
             if (jaw := find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])) is not None:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -161,14 +162,22 @@ class FingerMotion:
         apart = (tips[..., :, None, :] - tips[..., None, :, :]).square().sum(-1)
         return (apart[0] - apart.amin(0)).sum((-2, -1))
 
-    def spreading(self, straight: Joints, curls: list[Curl], moved: JointMask, palm_direction: Point) -> JointMask:
-        """Joints that move a straight finger's tip a little across the way in which it curls, and not to the palm."""
+    def spreading(
+        self, straight: Joints, curls: list[Curl], moved: JointMask, palm_direction: Point,
+        sweep: Float[np.ndarray, "3"] | None,
+    ) -> JointMask:
+        """Joints that move a straight finger's tip a little across the way in which it curls, and not to the palm.
+
+        Where fingers close alike along `sweep`, those of one that closes otherwise, a thumb, spread nothing.
+        """
         velocity, found = self.velocities(straight), torch.zeros_like(moved)
         small = moved & (self.tree.joint_unit == 1) & (self.tree.upper - self.tree.lower < WIDEST_SPREAD)
         for row, (finger, curl) in enumerate(zip(self.fingers, curls, strict=True)):
             others = self.tree.moves[finger.tip] & (curl.ways == 0) & bool(curl.ways.any())
             ways = torch.nn.functional.normalize(velocity[row], dim=0)
             closing = torch.nn.functional.normalize(velocity[row] @ curl.ways, dim=0)
+            if sweep is not None and abs(float(closing @ torch.from_numpy(sweep).float())) < LEVEL:
+                continue
             across = ((closing @ ways).abs() < ACROSS) & ((palm_direction @ ways).abs() < TO_PALM)
             found |= small & others & across & (velocity[row].norm(dim=0) > STILL)
         return found
