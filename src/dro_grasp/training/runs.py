@@ -96,8 +96,9 @@ class RunFolder:
         path, temporary, content = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part", io.BytesIO()
         torch.save(state, content)  # its own writer says of a full disk that a position was not expected
         try:
-            with self._writing(path):
-                temporary.write_bytes(content.getbuffer())
+            # An error's traceback would keep a view that is not released, which ends Python 3.12.1 later.
+            with self._writing(path), content.getbuffer() as view:
+                temporary.write_bytes(view)
                 os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
