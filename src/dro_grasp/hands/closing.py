@@ -186,7 +186,6 @@ FACING = 0.8
 """Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Of 16 hands: 0.86 to 1."""
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
-EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
 CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
 DECIDES = 0.3
 """Share of a finger's part in how much nearer fingertips come to each other from which on it tells where it closes (ours)."""
@@ -335,10 +334,12 @@ class ClosingFinder:
             with contextlib.suppress(HandError):
                 palm = self.examine(spread, signs, still)
                 ahead = float(_tensor(palm.direction) @ side) > AHEAD
-                sides.append((ahead, palm.score + self.lean(side), signs, palm))
+                sides.append((ahead, palm.score + self.lean(side), side, signs, palm))
         if not sides:
             raise HandError(NOTHING_ENCLOSED)
-        return max(sides, key=lambda found: found[:2])[2:]
+        ahead, _, side, signs, palm = max(sides, key=lambda found: found[:2])
+        # Where a thumb beside the fingers encloses more with them than the palm does, the palm still faces where they bend.
+        return signs, palm if ahead else self.examine(spread, signs, still, side.double().numpy())
 
     def lean(self, side: Point) -> float:
         """How far the fingers of the hand at rest lean to one side of the palm, and a thumb stands out there [m]."""
@@ -391,7 +392,10 @@ class ClosingFinder:
         """The direction in which straight fingers begin to close [unit vector], if they do it alike."""
         curls, sides = self.sides
         closing = torch.stack([curl.ways * side for curl, side in zip(curls, sides, strict=True)])
-        moved = (self.motion.velocities(self.straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
+        # Joints that drive a whole finger are where the finger is straight, whether or not that is where it is open.
+        whole = self.motion.whole(bends := self.movable & ~self.sideways & self.stated.isnan())
+        straight = self.motion.straight(self.straight, bends & whole) if bool(whole.any()) else self.straight
+        moved = (self.motion.velocities(straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
         way = torch.nn.functional.normalize(moved, dim=-1).mean(0) if len(moved) else torch.zeros(3)
         return _unit(way.double().numpy()) if len(moved) >= LEVEL_FINGERS and float(way.norm()) > TOGETHER else None
 
@@ -401,7 +405,7 @@ class ClosingFinder:
         bends = self.movable & ~self.sideways & self.stated.isnan()
         if not bool(bends.any()):
             return self.start
-        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT)
+        return self.motion.straight(self.start, bends & ~self.motion.whole(bends))
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:
@@ -418,7 +422,12 @@ class ClosingFinder:
         choices = torch.cartesian_prod(*[torch.tensor([1.0, -1.0])] * len(unsure)).reshape(-1, len(unsure))
         tried = torch.tensor(sides).repeat(len(choices), 1)
         tried[:, unsure] = choices
-        ways = tried @ torch.stack([curl.ways for curl in curls])
+        # Fingers that one joint curls close together.
+        each = torch.stack([curl.ways for curl in curls])
+        shared = each @ each.T
+        apart = (tried[:, :, None] * tried[:, None] * shared < 0).flatten(1).any(1)
+        tried = tried[~apart] if bool((~apart).any()) else tried
+        ways = tried @ each
         closed = torch.where(ways > 0, self.tree.upper, torch.where(ways < 0, self.tree.lower, straight))
         meeting = self.motion.meeting(straight, closed)
         best, most = tried[meeting.argmax()], meeting.max()
@@ -454,8 +463,8 @@ class ClosingFinder:
         spreading = self.motion.spreading(self.straight, self.sides[0], self.movable, direction, self.sweep)
         return along | self.sideways | spreading
 
-    def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
-        """The palm at the closing where palm and fingers enclose a ball best."""
+    def examine(self, opened: Joints, signs: Joints, abduction: JointMask, faced: Place | None = None) -> Palm:
+        """The palm at the closing where palm and fingers enclose a ball best; it faces a side if one is known or given."""
         jaw, on_palm, on_fingers = self.fixed_jaw(opened, signs, abduction), self.on_palm, self.on_fingers
         if jaw is not None:
             on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
@@ -464,11 +473,12 @@ class ClosingFinder:
         best = max((find_palm(*part) for part in parts), key=lambda palm: palm.score)
         if jaw is not None:
             return dataclasses.replace(best, direction=jaw.direction)
-        if self.sweep is None or best.direction @ self.sweep > FACING:
+        faced = self.sweep if faced is None else faced
+        if faced is None or best.direction @ faced > FACING:
             return best
         with contextlib.suppress(HandError):
-            best = max((find_palm(*part, self.sweep) for part in parts), key=lambda palm: palm.score)
-        return best if best.direction @ self.sweep > FACING else dataclasses.replace(best, direction=self.sweep)
+            best = max((find_palm(*part, faced) for part in parts), key=lambda palm: palm.score)
+        return best if best.direction @ faced > FACING else dataclasses.replace(best, direction=faced)
 
     @cached_property
     def on_fingers(self) -> list[Bool[np.ndarray, " n"]]:

@@ -24,6 +24,7 @@ from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
 STEPS = 64  # Steps in which a joint's range, or the way from closed to open, is searched (ours)
 SWEEPS = 24  # Most rounds of the search over all joints (ours); hands need 1 to 10
 SAME_SPAN = 1e-4  # Spans that differ by less are the same [m] (ours)
+EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
 KNUCKLE = 0.5  # Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less
 BEHIND = 0.9
 """Angle by which an opened finger that folds back points behind the plane of its palm [rad] (ours). At the limits of their
@@ -222,9 +223,23 @@ class FingerMotion:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
 
-    def straightest(self, start: Joints, bends: JointMask, same: float = SAME_SPAN) -> Joints:
+    def straightest(self, start: Joints, bends: JointMask) -> Joints:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
-        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends, same)
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+
+    def straight(self, start: Joints, bends: JointMask) -> Joints:
+        """The posture whose fingertips are farthest from where their fingers begin to curl; of equal ones the nearest."""
+        # A joint before that, as one that spreads the finger, makes it no straighter, wherever its axis is.
+        hinged, firsts = self.hinges(start) & bends, []
+        for finger in self.fingers:
+            curling = [link for link in finger.chain if bool(hinged[self.tree.link_coupling[link] != 0].any())]
+            firsts.append(curling[0] if curling else self._knuckle(finger, bends))
+
+        def reach(q: Float[Tensor, "m n_dof"]) -> Float[Tensor, " m"]:
+            begin = se3.apply(self.tree.forward(q)[..., firsts, :, :], self.tree.anchor[firsts])
+            return (self.tips(q) - begin).norm(dim=-1).sum(-1)
+
+        return self._best(reach, start, bends, EXACT)
 
     def _best(
         self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask,
