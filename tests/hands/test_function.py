@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +206,24 @@ def test_a_flat_hand_is_doubtful_until_it_is_stated_how_it_closes(tmp_path: Path
     assert not doubts(stated)
 
 
+@pytest.mark.parametrize("angle", [2.2, 2.36, 2.5])
+def test_the_palm_of_a_flat_hand_faces_where_its_fingers_bend_whatever_a_thumb_encloses(tmp_path: Path, angle: float) -> None:
+    """A plate out of the palm and the thumb beside it surround a ball, beside the row of fingers; all hinges bend both ways."""
+    def hinges(name: str, first: str, axis: str) -> list[tuple[str, str, float, float, float]]:
+        return [(f"{name}_{i}", axis if i else first, -QUARTER, QUARTER, length) for i, length in enumerate((0.028, 0.05, 0.06))]
+
+    row = [finger(f"f{i}_", f'0 {0.035 * i:.3f} {0.09 - 0.025 * i:.3f}" rpy="-0.3 0 0', hinges(f"f{i}", "1 0 0", "0 1 0"))
+           for i in range(3)]
+    thumb = finger("t_", '0.05 -0.06 -0.01" rpy="0 1.5708 0',
+                   hinges("t", "0 0 1", f"{math.cos(angle):.4f} {math.sin(angle):.4f} 0"))
+    plate = block("plate", "0.09 0.02 0.09") + fixed("plate", "0.05 -0.02 -0.03")
+    report = checked(tmp_path, robot(block("palm", "0.026 0.11 0.09", "0 0.02 0"), *row, thumb, plate))
+    assert report.facts["palm_direction"] == pytest.approx([0.95, 0, 0.3], abs=0.15)
+    assert (report.facts["thumb"], report.facts["side"]) == ("t_3", "left")
+    assert signs(report, "f0_1", "f1_1", "f2_1", "f0_2", "f1_2", "f2_2") == [-1] * 6
+    assert any("guess" in text for text in doubts(report))
+
+
 def test_a_keyframe_of_an_mjcf_may_state_how_it_closes(tmp_path: Path) -> None:
     one = ("<body name='{0}' pos='{1} 0 .01'><joint name='{0}' axis='0 1 0' range='-1.4 1.4'/>"
            "<geom type='box' size='.006 .006 .03' pos='0 0 .03'/></body>")
@@ -270,3 +289,13 @@ def test_a_whole_finger_that_one_joint_bends_back_shows_where_the_palm_is_when_s
     report = checked(tmp_path, text)
     assert report.facts["palm_direction"] == pytest.approx([1, 0, 0], abs=0.3)
     assert report.facts["side"] == SIDES[side]
+
+
+@pytest.mark.parametrize(("farthest", "told"), [(1.2, False), (2.4, True)])
+def test_a_thumb_that_opens_to_the_wrist_is_told(tmp_path: Path, farthest: float, told: bool) -> None:
+    """It swings about an axis across the palm, from the fingers' direction over the palm's to the wrist's."""
+    hinges = [("thumb_swing", "0 1 0", 0.4, farthest, 0.04), ("thumb_ip", "0 -1 0", 0.0, 1.0, 0.03)]
+    text = human(hinges).replace('rpy="-0.9 0 0"', 'rpy="0 0 0"')
+    report = checked(tmp_path, text)
+    assert report.facts["open_posture"]["thumb_swing"] == pytest.approx(farthest, abs=0.01)
+    assert [subject.subject for subject in report.notes if "towards the wrist" in subject.text] == ["thumb2"] * told

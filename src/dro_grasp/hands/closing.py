@@ -265,7 +265,7 @@ class ClosingFinder:
         signs, palm = other.better_side(straight)
         abduction = other.out_of_palm(straight, signs, palm) & self.movable
         closing = other.straight_about(Closing(signs, straight, abduction, palm), everywhere=True)
-        if closing is None or float(_tensor(closing.palm.direction) @ _tensor(palm.direction)) > AHEAD:
+        if closing is None or float(_tensor(closing.palm.direction) @ _tensor(palm.direction)) > FACING:
             return closing
         return dataclasses.replace(closing, palm=palm)  # its thumb, which opens otherwise now, would turn it
 
@@ -337,9 +337,10 @@ class ClosingFinder:
                 sides.append((ahead, palm.score + self.lean(side), side, signs, palm))
         if not sides:
             raise HandError(NOTHING_ENCLOSED)
-        ahead, _, side, signs, palm = max(sides, key=lambda found: found[:2])
+        _, _, side, signs, palm = max(sides, key=lambda found: found[:2])
         # Where a thumb beside the fingers encloses more with them than the palm does, the palm still faces where they bend.
-        return signs, palm if ahead else self.examine(spread, signs, still, side.double().numpy())
+        facing = float(_tensor(palm.direction) @ side) > FACING
+        return signs, palm if facing else self.examine(spread, signs, still, side.double().numpy())
 
     def lean(self, side: Point) -> float:
         """How far the fingers of the hand at rest lean to one side of the palm, and a thumb stands out there [m]."""

@@ -29,6 +29,9 @@ KNUCKLE = 0.5  # Range of a finger's knuckle, as a share of the widest range of 
 BEHIND = 0.9
 """Angle by which an opened finger that folds back points behind the plane of its palm [rad] (ours). At the limits of their
 ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.3."""
+TO_WRIST = 2.4
+"""Angle between an open thumb and the other fingers from which on it points to the wrist [rad] (ours): 138 degrees. Of 31 hands
+with a thumb, four have 142 to 160, all others 121 at most, but LEAP's, whose fingers do not lie side by side."""
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
@@ -324,7 +327,22 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes
+    return notes + _thumb_to_wrist(hand)
+
+
+def _thumb_to_wrist(hand: Hand) -> list[Note]:
+    """A thumb that opens away from fingers that lie side by side, as those of a flat hand do."""
+    if hand.thumb is None:
+        return []
+    reach = FingerMotion.of(hand).reaches(hand.canonical_joints(1.0), hand.movable & ~hand.abduction)
+    along = torch.nn.functional.normalize(reach, dim=-1)
+    others = along[torch.arange(len(along)) != hand.thumb].mean(0)
+    angle = float(torch.acos(torch.nn.functional.cosine_similarity(along[hand.thumb], others, dim=0).clamp(-1, 1)))
+    if angle < TO_WRIST or float(others.norm()) < ALIKE:
+        return []
+    text = (f"points {math.degrees(angle):.0f} degrees away from the other fingers in the open posture, towards the wrist. If it "
+            "is of no use there, state another open posture")
+    return [Note("warning", hand.tree.link_names[hand.tips[hand.thumb]], text)]
 
 
 def guessed_side(hand: Hand) -> Note | None:
