@@ -207,7 +207,7 @@ def test_a_flat_hand_is_doubtful_until_it_is_stated_how_it_closes(tmp_path: Path
 
 
 @pytest.mark.parametrize("angle", [2.2, 2.36, 2.5])
-def test_the_palm_of_a_flat_hand_faces_where_its_fingers_bend_whatever_a_thumb_encloses(tmp_path: Path, angle: float) -> None:
+def test_the_palm_of_a_flat_hand_faces_where_fingers_bend_whatever_a_thumb_does(tmp_path: Path, angle: float) -> None:
     """A plate out of the palm and the thumb beside it surround a ball, beside the row of fingers; all hinges bend both ways."""
     def hinges(name: str, first: str, axis: str) -> list[tuple[str, str, float, float, float]]:
         return [(f"{name}_{i}", axis if i else first, -QUARTER, QUARTER, length) for i, length in enumerate((0.028, 0.05, 0.06))]
@@ -248,7 +248,8 @@ def test_the_picture_tells_of_a_doubt(tmp_path: Path) -> None:
 
     red, black = words(checked(tmp_path, FLAT, f"{'a_hand_of_a_long_name' * 2}.urdf"))
     beside = black[(black[:, 0] >= red[:, 0].min()) & (black[:, 0] <= red[:, 0].max())]
-    assert len(beside) and beside[:, 1].max() + 10 < red[:, 1].min(), "words lie on one another"
+    assert len(beside)
+    assert beside[:, 1].max() + 10 < red[:, 1].min(), "words lie on one another"
     assert not len(words(checked(tmp_path, human(), "sure.urdf"))[0])
 
 
@@ -262,7 +263,8 @@ def test_hands_that_are_read_right_are_not_doubted(name: str) -> None:
 @pytest.mark.parametrize("way", [1, -1])
 def test_fingers_of_one_joint_close_where_they_meet_the_thumb(tmp_path: Path, way: int) -> None:
     """Three fingers of a hinge each follow one joint, which bends them to one side only; the index bends both ways."""
-    hinge = [("index", -1.4, 1.4, ""), ("middle", 0, 1.4, ""), *((name, 0, 1.4, '<mimic joint="middle"/>') for name in ("ring", "little"))]
+    follows = [(name, 0, 1.4, '<mimic joint="middle"/>') for name in ("ring", "little")]
+    hinge = [("index", -1.4, 1.4, ""), ("middle", 0, 1.4, ""), *follows]
     fingers = [finger(name, f"0 {0.033 - 0.022 * i} 0.05", [(name, f"0 {way} 0", lower, upper, 0.08)], mimic=mimic)
                for i, (name, lower, upper, mimic) in enumerate(hinge)]
     thumb = finger("thumb", f'{way * 0.02} 0.05 -0.02" rpy="-0.3 {way * 0.9} 0', [("thumb", f"0 {-way} 0", 0, 1.1, 0.06)])
@@ -282,7 +284,8 @@ def test_a_whole_finger_that_one_joint_bends_back_shows_where_the_palm_is_when_s
         place = text.split('<ORIGIN xyz="')[1].split('"')[0]
         text = text.replace(f'<ORIGIN xyz="{place}"/>', f'<origin xyz="{place}" rpy="0 0.6 0"/>')
         text = text.replace(f'<child link="{name}2"/><origin xyz="0 0 0.045"/>',
-                            f'<child link="{name}2"/><origin xyz="0 0 0.045" rpy="0 0.9 0"/><mimic joint="{name}_mcp" multiplier="1.5"/>')
+                            f'<child link="{name}2"/><origin xyz="0 0 0.045" rpy="0 0.9 0"/>'
+                            f'<mimic joint="{name}_mcp" multiplier="1.5"/>')
         before, after = text.split(f'<joint name="{name}_mcp"')
         text = f'{before}<joint name="{name}_mcp"' + after.replace('lower="-0.0"', 'lower="-0.6"', 1).replace(
             'upper="1.57"', 'upper="0.9"', 1).replace('lower="-0.0"', 'lower="-0.9"', 1)

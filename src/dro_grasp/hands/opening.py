@@ -340,8 +340,8 @@ def _thumb_to_wrist(hand: Hand) -> list[Note]:
     angle = float(torch.acos(torch.nn.functional.cosine_similarity(along[hand.thumb], others, dim=0).clamp(-1, 1)))
     if angle < TO_WRIST or float(others.norm()) < ALIKE:
         return []
-    text = (f"points {math.degrees(angle):.0f} degrees away from the other fingers in the open posture, towards the wrist. If it "
-            "is of no use there, state another open posture")
+    text = (f"points {math.degrees(angle):.0f} degrees away from the other fingers in the open posture, towards the wrist. If "
+            "it is of no use there, state another open posture")
     return [Note("warning", hand.tree.link_names[hand.tips[hand.thumb]], text)]
 
 
