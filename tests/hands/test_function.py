@@ -210,7 +210,8 @@ def test_a_flat_hand_is_doubtful_until_it_is_stated_how_it_closes(tmp_path: Path
 def test_the_palm_of_a_flat_hand_faces_where_fingers_bend_whatever_a_thumb_does(tmp_path: Path, angle: float) -> None:
     """A plate out of the palm and the thumb beside it surround a ball, beside the row of fingers; all hinges bend both ways."""
     def hinges(name: str, first: str, axis: str) -> list[tuple[str, str, float, float, float]]:
-        return [(f"{name}_{i}", axis if i else first, -QUARTER, QUARTER, length) for i, length in enumerate((0.028, 0.05, 0.06))]
+        lengths = (0.028, 0.05, 0.06)
+        return [(f"{name}_{i}", axis if i else first, -QUARTER, QUARTER, length) for i, length in enumerate(lengths)]
 
     row = [finger(f"f{i}_", f'0 {0.035 * i:.3f} {0.09 - 0.025 * i:.3f}" rpy="-0.3 0 0', hinges(f"f{i}", "1 0 0", "0 1 0"))
            for i in range(3)]
