@@ -37,6 +37,7 @@ Place = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
 Mask = Bool[np.ndarray, " n"]
 GRID_SPACING = 0.008  # Spacing of candidate ball centres [m] (ours)
+GRID_CELLS = 200_000  # Number of them in a hand's box beyond which they lie farther apart (ours): that of a box of half a metre
 CLOSINGS = (0.35, 0.5, 0.65)  # Shares of the way from open to closed at which the hand is examined (ours)
 EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
 """Shares of the way from open to closed at which hands whose fingers may roll up are examined as well (ours)."""
@@ -81,7 +82,8 @@ def find_palm(
     except QhullError as error:
         raise HandError(NOTHING_ENCLOSED) from error
     low, high = everything.min(0), everything.max(0)
-    axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
+    spacing = max(GRID_SPACING, float(np.prod(high - low) / GRID_CELLS) ** (1 / 3))
+    axes = [np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     planes = np.unique(hull.equations.round(6), axis=0)
     for some in np.array_split(planes, math.ceil(len(planes) / 32)):  # most centres fall to the first planes

@@ -113,6 +113,31 @@ def test_masks_that_show_nothing_are_refused(depth: np.ndarray, mask: np.ndarray
         depth_points(depth, INTRINSICS, mask)
 
 
+@pytest.mark.parametrize("depth_of_one", [-0.1, 0.0, 1e-9, 0.001])
+def test_points_beside_the_camera_are_refused(mug: ObjectModel, depth_of_one: float) -> None:
+    seen = mug.cloud - mug.cloud.mean(0) + [0, 0, 0.5]
+    stray = [0.1, 0, depth_of_one] + np.linspace(0, 0.01, 40)[:, None] * [0, 1, 0]
+    scanned_object("mug", seen)
+    with pytest.raises(ObjectError, match="points behind or beside the camera"):
+        scanned_object("mug", np.concatenate([seen, stray]), denoise=False, keep_table=True)
+
+
+@pytest.mark.parametrize(("median", "units"), [
+    (45.0, ["0.45 m in centimetres (divide by 100)"]),
+    (600.0, ["6 m in centimetres (divide by 100)", "0.6 m in millimetres (divide by 1000)"]),
+    # A room in millimetres, or a bench in tenths of one: only who knows the camera knows which.
+    (3500.0, ["3.5 m in millimetres (divide by 1000)", "0.35 m in tenths of a millimetre (divide by 10000)"]),
+    (450000.0, ["0.45 m in micrometres (divide by 1000000)"]),
+    (1e9, ["too far for any unit"]),
+])
+def test_depths_in_other_units_are_refused_with_all_that_they_may_be(median: float, units: list[str]) -> None:
+    with pytest.raises(ObjectError) as caught:
+        depth_points(np.full(SHAPE, median), INTRINSICS)
+    told = str(caught.value)
+    assert all(unit in told for unit in units)
+    assert told.count("divide by") == sum("divide by" in unit for unit in units)
+
+
 def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:
     part = depth[10:80, 60:150]
     matrix = INTRINSICS - np.array([[0, 0, 60.0], [0, 0, 10], [0, 0, 0]])

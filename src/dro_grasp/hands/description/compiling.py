@@ -151,6 +151,10 @@ def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
         if np.abs(model.jnt_range[j]).max() > MAX_LENGTH:
             raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
                             f"at most {MAX_LENGTH:g} m; this looks like millimetres: scale the file by 0.001")
+    # MuJoCo divides an axis by its length, which overflows.
+    for j in np.flatnonzero(~(np.linalg.norm(model.jnt_axis, axis=1) > 0.5)):
+        raise HandError(f"{path}: the axis of joint '{model.joint(j).name}' is beyond all numbers; expected a direction, "
+                        "such as 0 0 1")
     for kind, array, what, largest in NUMBERS:
         values = np.asarray(getattr(model, array), float)
         values = values[:, None] if values.ndim == 1 else values[:, :4]

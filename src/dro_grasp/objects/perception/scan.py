@@ -37,7 +37,8 @@ RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 """Widths of other images that a camera's matrix may be of, over that of the given one [1] (ours)."""
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
-FAR_DEPTH = 2.0  # Largest median depth of an image of things to grasp [m] (ours)
+DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
+LEAST_DEPTH = 0.01  # Depth of a point that a camera sees, as a share of the mean depth [1] (ours)
 FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
@@ -111,13 +112,14 @@ def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int,
 
 def _check_depths(median: float) -> None:
     """Refuse depths whose median is too far for metres, by an ObjectError that names their likely unit."""
-    if median <= 10.0:  # [m] (ours)
+    least, most = DEPTHS
+    if median <= most:
         return
-    unit, most = next(((unit, 1 / size) for unit, size in DEPTH_UNITS.items() if median * size <= FAR_DEPTH), ("pixels", 0.0))
-    if not most:
+    found = {unit: size for unit, size in DEPTH_UNITS.items() if least <= median * size <= most}
+    if not found:
         raise ObjectError(f"the median depth is {median:g}, too far for any unit; give depths along z in metres")
-    raise ObjectError(f"the median depth is {median:g}, too far for metres; in {unit} it is {median / most:.3g} m: "
-                      f"divide {unit} by {most:g}")
+    told = " or ".join(f"{median * size:.3g} m in {unit} (divide by {1 / size:.0f})" for unit, size in found.items())
+    raise ObjectError(f"the median depth is {median:g}, too far for metres; it is {told}")
 
 
 def load_scan(
@@ -204,9 +206,10 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     if len(rows) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
     check_view(rows[:, :3], name)
-    if float((rows[:, :3] @ rows[:, :3].mean(0)).min()) <= 0:
-        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
-                          "camera's frame")
+    middle = rows[:, :3].mean(0)
+    if float((rows[:, :3] @ middle).min()) <= LEAST_DEPTH * float(middle @ middle):
+        raise ObjectError(f"{name} has points behind or beside the camera, which is at the cloud's origin; give the cloud in "
+                          "the camera's frame")
     return Cleaned(rows, table, cut, total, told)
 
 
