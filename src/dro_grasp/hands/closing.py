@@ -28,7 +28,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, ONE_WAY, Curl, FingerMotion, Line
+from dro_grasp.hands.opening import BOTH_WAYS, EXACT, FAR_BACK, ONE_WAY, Curl, FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -237,7 +237,7 @@ class ClosingFinder:
         other = dataclasses.replace(self, sideways=self.spreading(found).sideways & of_folded)
         abduction = (found.abduction | other.sideways) & self.movable
         cut = of_folded & other.bending(abduction)
-        straight = torch.where(cut, self.straight, self.start)
+        straight = torch.where(cut, self.outstretched, self.start)
         knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
         room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
         half = dataclasses.replace(tree, lower=torch.where(opening > 0, tree.lower + room, tree.lower),
@@ -395,9 +395,7 @@ class ClosingFinder:
         """The direction in which straight fingers begin to close [unit vector], if they do it alike."""
         curls, sides = self.sides
         closing = torch.stack([curl.ways * side for curl, side in zip(curls, sides, strict=True)])
-        # Joints that drive a whole finger are where the finger is straight, whether or not that is where it is open.
-        whole = self.motion.whole(bends := self.movable & ~self.sideways & self.stated.isnan())
-        straight = self.motion.straight(self.straight, bends & whole) if bool(whole.any()) else self.straight
+        straight = self.wholly_straight
         moved = (self.motion.velocities(straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
         way = torch.nn.functional.normalize(moved, dim=-1).mean(0) if len(moved) else torch.zeros(3)
         return _unit(way.double().numpy()) if len(moved) >= LEVEL_FINGERS and float(way.norm()) > TOGETHER else None
@@ -406,9 +404,23 @@ class ClosingFinder:
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
         bends = self.movable & ~self.sideways & self.stated.isnan()
-        if not bool(bends.any()):
-            return self.start
-        return self.motion.straight(self.start, bends & ~self.motion.whole(bends))
+        return self.motion.straight(self.start, bends & ~self.motion.whole(bends)) if bool(bends.any()) else self.start
+
+    @cached_property
+    def outstretched(self) -> Joints:
+        """Fingers that reach the farthest from their knuckles [rad or m]."""
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        alone = bends & ~self.motion.whole(bends) if bool(bends.any()) else bends
+        return self.motion.straightest(self.start, alone, EXACT) if bool(alone.any()) else self.start
+
+    @cached_property
+    def wholly_straight(self) -> Joints:
+        """Straight fingers, joints that drive a whole one included, unless that bends it far back [rad or m]."""
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        if not bool(bends.any()) or not bool((whole := bends & self.motion.whole(bends)).any()):
+            return self.straight
+        found = self.motion.straight(self.straight, whole)
+        return torch.where((found - self.straight).abs() < FAR_BACK, found, self.straight)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:

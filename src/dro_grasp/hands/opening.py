@@ -7,7 +7,7 @@ let it fold back closes on nothing on the way from there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -226,9 +226,9 @@ class FingerMotion:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
 
-    def straightest(self, start: Joints, bends: JointMask) -> Joints:
+    def straightest(self, start: Joints, bends: JointMask, same: float = SAME_SPAN) -> Joints:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
-        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends, same)
 
     def straight(self, start: Joints, bends: JointMask) -> Joints:
         """The posture whose fingertips are farthest from where their fingers begin to curl; of equal ones the nearest."""
@@ -236,7 +236,8 @@ class FingerMotion:
         hinged, firsts = self.hinges(start) & bends, []
         for finger in self.fingers:
             curling = [link for link in finger.chain if bool(hinged[self.tree.link_coupling[link] != 0].any())]
-            firsts.append(curling[0] if curling else self._knuckle(finger, bends))
+            free = bool(curling) and not bool(self._driving([finger], curling[:1]).any())
+            firsts.append(curling[0] if free else self._knuckle(finger, bends))
 
         def reach(q: Float[Tensor, "m n_dof"]) -> Float[Tensor, " m"]:
             begin = se3.apply(self.tree.forward(q)[..., firsts, :, :], self.tree.anchor[firsts])
@@ -270,8 +271,11 @@ class FingerMotion:
 
     def whole(self, bends: JointMask) -> JointMask:
         """Joints that bend a finger at its knuckle and, by couplings, beyond it: where it reaches farthest, it is not open."""
-        firsts = [self._knuckle(finger, bends) for finger in self.fingers]
-        beyond = [link for finger, first in zip(self.fingers, firsts, strict=True) for link in finger.chain if link > first]
+        return self._driving(self.fingers, [self._knuckle(finger, bends) for finger in self.fingers])
+
+    def _driving(self, fingers: Sequence[Finger], firsts: list[int]) -> JointMask:
+        """Joints that, by couplings, drive the given link of each finger and links beyond it."""
+        beyond = [link for finger, first in zip(fingers, firsts, strict=True) for link in finger.chain if link > first]
         return (self.tree.link_coupling[firsts] != 0).any(0) & (self.tree.link_coupling[beyond] != 0).any(0)
 
     def folded(
