@@ -29,6 +29,20 @@ DERIVED = {"fingers", "rigid_group", "thumb"}  # Fields that follow from the oth
 
 
 @dataclass(frozen=True)
+class Segments:
+    """The points of each registrable link, padded to one length."""
+
+    links: Int[Tensor, " l"]
+    index: Int[Tensor, "l p"]  # rows of the hand's surface points; 0 where padded
+    weight: Float[Tensor, "l p"]  # 1, or 0 where padded
+    local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
+
+    def to(self, like: Tensor) -> Segments:
+        """The same on the device, and in the precision, of a tensor."""
+        return Segments(self.links.to(like.device), self.index.to(like.device), self.weight.to(like), self.local.to(like))
+
+
+@dataclass(frozen=True)
 class Hand:
     """A hand and everything that was derived from its description."""
 
@@ -128,6 +142,45 @@ class Hand:
         margin = 0.25 * (self.tree.upper - self.tree.lower)
         return torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
 
+    @cached_tensor
+    def pointed_fingers(self) -> Int[Tensor, " k"]:
+        """Indices of the fingers that have surface points."""
+        found = self.finger_of_link[self.link_index].unique()
+        return found[found != PALM]
+
+    @cached_tensor
+    def segments(self) -> Segments:
+        """The surface points of each registrable link."""
+        links = self.registrable.nonzero()[:, 0]
+        rows = [(self.link_index == link).nonzero()[:, 0] for link in links]
+        index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+        lengths = torch.tensor([len(row) for row in rows], device=index.device)
+        weight = (torch.arange(index.shape[1], device=index.device) < lengths[:, None]).to(self.link_points)
+        return Segments(links, index, weight, self.link_points[index])
+
+    @cached_tensor
+    def finger_links(self) -> Bool[Tensor, "n_tips n_links"]:
+        """The links of each finger."""
+        table = torch.zeros(len(self.fingers), self.tree.n_links, dtype=torch.bool)
+        for index, finger in enumerate(self.fingers):
+            table[index, list(finger.links)] = True
+        return table.to(self.link_points.device)
+
+    @cached_tensor
+    def finger_joints(self) -> Bool[Tensor, "n_tips n_dof"]:
+        """The joints that move each finger, alone or with others."""
+        return torch.stack([self.tree.moves[list(finger.links)].any(0) for finger in self.fingers])
+
+    @cached_tensor
+    def point_links(self) -> Int[Tensor, " l"]:
+        """Links that have surface points, ascending."""
+        return self.link_index.unique()
+
+    @cached_tensor
+    def link_middles(self) -> Float[Tensor, "l 3"]:
+        """Mean of the surface points of each of `point_links`, in its frame [m]."""
+        return torch.stack([self.link_points[self.link_index == link].mean(0) for link in self.point_links])
+
     @property
     def n_points(self) -> int:
         """Number of surface points."""
@@ -142,7 +195,7 @@ class Hand:
     def registrable(self) -> Bool[Tensor, " n_links"]:
         """Links whose pose their own points determine."""
         mask = torch.zeros(self.tree.n_links, dtype=torch.bool, device=self.link_points.device)
-        for link in self.link_index.unique().tolist():
+        for link in self.point_links.tolist():
             points = self.link_points[self.link_index == link]
             if len(points) >= MIN_REGISTRATION_POINTS:
                 spread = torch.linalg.svdvals(points - points.mean(0))
@@ -265,9 +318,9 @@ class Hand:
         if count == self.n_points:
             return self
         rank = self.spread_rank
-        per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.link_index.unique()))))
+        per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.point_links))))
         first = torch.zeros(self.n_points, dtype=torch.bool, device=rank.device)
-        for link in self.link_index.unique().tolist():
+        for link in self.point_links.tolist():
             members = (self.link_index == link).nonzero()[:, 0]
             first[members[rank[members].argsort()[:per_link]]] = True
         priority = torch.where(first, rank - self.n_points, rank)

@@ -101,8 +101,23 @@ class KinematicTree:
         return torch.tensor([i for i, parent in enumerate(self.parent) if parent < 0], device=self.origin.device)
 
     @cached_tensor
+    def parents(self) -> Int[Tensor, " n_links"]:
+        """`parent` as a tensor."""
+        return torch.tensor(self.parent, device=self.origin.device)
+
+    @cached_tensor
+    def link_joints(self) -> Int[Tensor, " n_links"]:
+        """`link_joint` as a tensor."""
+        return torch.tensor(self.link_joint, device=self.origin.device)
+
+    @cached_tensor
+    def kinds(self) -> Int[Tensor, " n_links"]:
+        """`kind` as a tensor."""
+        return torch.tensor(self.kind, device=self.origin.device)
+
+    @cached_tensor
     def _revolute(self) -> Bool[Tensor, " n_links"]:
-        return torch.tensor(self.kind, device=self.origin.device) == REVOLUTE
+        return self.kinds == REVOLUTE
 
     @cached_tensor
     def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
@@ -110,7 +125,7 @@ class KinematicTree:
         # For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
         # motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
         turns = self._revolute[:, None]
-        slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
+        slides = self.kinds[:, None] == PRISMATIC
         k = _skew(self.axis * turns)
         basis = self.origin.new_zeros(4, self.n_links, 4, 4)
         basis[0] = torch.eye(4)
@@ -131,7 +146,7 @@ class KinematicTree:
     @cached_tensor
     def link_offset(self) -> Float[Tensor, " n_links"]:
         """Value of each link's own joint at q = 0."""
-        joint = torch.tensor(self.link_joint, device=self.offset.device)
+        joint = self.link_joints
         # Fixed links have joint -1, which indexes the appended zero.
         return torch.cat([self.offset, self.offset.new_zeros(1)])[joint]
 
