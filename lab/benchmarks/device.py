@@ -1,10 +1,10 @@
 """Prediction, synthesis and training on a GPU, beside the processor in the same run.
 
 Hands and objects are built in. Prediction is of candidates of the network alone: many of one pair, some of many pairs of one
-hand, and the four of which one grasp is chosen, by stage, with settling and without. The first run, which compiles and captures,
-is told apart. Candidates of many pairs are of sixteen objects, each of which comes four times as an object of its own. Synthesis
-is the optimiser's descent, without trials. Training is a step of the preset with its own number of object points, in bfloat16
-where `--mixed` would be given.
+hand, and the four of which one grasp is chosen, by stage, with settling and without. The first run, which captures graphs, is
+told apart. Many pairs are of sixteen objects, each of which comes four times as an object of its own. Synthesis is the
+optimiser's descent, without trials. Training is a step of the preset with its own number of object points, in bfloat16 where
+`--mixed` would be given.
 
     python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis] [--bundle FILE] [--quick] [--json]
 """
@@ -43,6 +43,7 @@ REPETITIONS = 3
 PREDICTIONS = {"cpu": ((1, 16, 1), (1, 1, 4)), "gpu": ((1, 1024, 1), (64, 16, 1), (1, 1, 4))}
 """Pairs, grasps of each, and candidates of each grasp."""
 STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
+SETTLED = (False, True)  # Whether candidates close in simulation, on the processor
 DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 BATCHES = {"cpu": ((4, 4),), "gpu": ((4, 4), (8, 32), (8, 128))}
@@ -84,7 +85,7 @@ def predictions(device: str, repetitions: int) -> list[list[object]]:
     hand, rows = load_hand(HAND), []
     for pairs, num, candidates in PREDICTIONS[kind(device)]:
         models = objects(pairs)
-        for settled in (False, True):
+        for settled in SETTLED:
             finish = FinishConfig() if settled else FinishConfig(settle=None)
             predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
             request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)

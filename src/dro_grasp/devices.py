@@ -13,7 +13,7 @@ from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
@@ -48,14 +48,23 @@ def cores() -> int:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Within the block, PyTorch computes in one thread: several add to the CPU time of a task, and wait for each other."""
+def one_thread(device: torch.device | str = "cpu") -> Iterator[None]:
+    """Within the block, PyTorch computes in one thread: several add to the CPU time of a task, and wait for each other.
+
+    Nothing changes for work on another device.
+    """
+    if on_accelerator(device):
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+OTHER = "meta"  # Any device that is not the CPU
 
 
 def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
@@ -67,7 +76,7 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
     jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
     on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
     if min(len(jobs), threads) < 2 or not on_cpu:
-        with one_thread():
+        with one_thread("cpu" if on_cpu else OTHER):
             return [work(*job) for job in jobs]
 
     def prepare() -> None:  # both settings belong to a thread
@@ -183,7 +192,7 @@ def _capture_stream(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
 
 
-def _leaves(value: Any) -> list[Tensor]:
+def _leaves(value: Any) -> list[Shaped[Tensor, "..."]]:
     """The tensors of a tensor, a tuple, or a record of them."""
     if isinstance(value, Tensor):
         return [value]
@@ -191,7 +200,7 @@ def _leaves(value: Any) -> list[Tensor]:
     return [leaf for part in parts for leaf in _leaves(part)]
 
 
-def _rebuilt(like: Any, leaves: Iterator[Tensor]) -> Any:
+def _rebuilt(like: Any, leaves: Iterator[Shaped[Tensor, "..."]]) -> Any:
     """Such a value of other tensors."""
     if isinstance(like, Tensor):
         return next(leaves)

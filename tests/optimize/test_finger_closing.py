@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 
 import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimize.fingers import ClosingConfig, close_idle_fingers
-from dro_grasp.optimize.terms import SpherePairs
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.optimize.terms import SpherePairs
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import toy_hand
 

@@ -36,7 +36,7 @@ def nonnegative_least_squares(
     return repeat(advance, (none, none), iterations)[0]
 
 
-def _momenta(iterations: int, like: Tensor) -> Float[Tensor, " iterations"]:
+def _momenta(iterations: int, like: Float[Tensor, "..."]) -> Float[Tensor, " iterations"]:
     """How far each iteration looks ahead, as a share of its step."""
     momentum, found = 1.0, []
     for _ in range(iterations):

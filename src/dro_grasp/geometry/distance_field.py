@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -83,7 +84,36 @@ class DistanceField:
         place = (points - self.origin) / self.spacing
         index = torch.minimum(place.round().clamp_min(0), self._top)
         offset = (place - index) * self.spacing
-        return (index @ self._strides).to(torch.int64), offset
+        return (index * self._strides).sum(-1).to(torch.int64), offset
+
+
+class _Stack(NamedTuple):
+    """Several fields, one after the other; as those of `DistanceFields`, with one row for each field."""
+
+    fields: tuple[DistanceField, ...]
+    slopes: Float[Tensor, "voxels 4"]
+    curvatures: Float[Tensor, "voxels 9"]
+    first: Int[Tensor, " o"]
+    top: Float[Tensor, "o 3"]
+    strides: Float[Tensor, "o 3"]
+    origin: Float[Tensor, "o 3"]
+    spacing: Float[Tensor, " o"]
+
+    @staticmethod
+    def of(fields: Sequence[DistanceField]) -> _Stack:
+        """Stack fields of one device; the first keeps the stack, since stages in turn ask for the same."""
+        kept = vars(fields[0]).get("_stack")
+        if kept is not None and len(kept.fields) == len(fields) and all(map(operator.is_, kept.fields, fields)):
+            return kept
+        device, sizes = fields[0].slopes.device, torch.tensor([0] + [len(field.slopes) for field in fields])
+        slopes, curvatures = (torch.cat([getattr(field, name) for field in fields]) for name in ("slopes", "curvatures"))
+        top, strides, origin = (
+            torch.stack([getattr(field, name) for field in fields]) for name in ("_top", "_strides", "origin"))
+        spacing = torch.tensor([field.spacing for field in fields]).to(origin)
+        made = _Stack(
+            tuple(fields), slopes, curvatures, sizes.cumsum(0)[:-1].to(device), top, strides, origin, spacing)
+        vars(fields[0])["_stack"] = made
+        return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,15 +132,10 @@ class DistanceFields:
     def of(fields: Sequence[DistanceField], counts: Sequence[int]) -> DistanceFields:
         """Fields of so many rows each; a field that comes twice is kept once."""
         own = list({id(field): field for field in fields}.values())
-        device, sizes = own[0].slopes.device, torch.tensor([0] + [len(field.slopes) for field in own])
-        place = {id(field): k for k, field in enumerate(own)}
-        which = torch.tensor([place[id(field)] for field in fields]).repeat_interleave(torch.tensor(counts)).to(device)
-        first, spacing = sizes.cumsum(0)[:-1].to(device), torch.tensor([field.spacing for field in own])
-        top, strides, origin = (
-            torch.stack([getattr(field, name) for field in own]) for name in ("_top", "_strides", "origin"))
-        slopes, curvatures = (torch.cat([getattr(field, name) for field in own]) for name in ("slopes", "curvatures"))
-        return DistanceFields(slopes, curvatures, first[which], top[which], strides[which], origin[which],
-                              spacing.to(origin)[which])
+        place, stack = {id(field): k for k, field in enumerate(own)}, _Stack.of(own)
+        which = torch.tensor([place[id(field)] for field in fields]).repeat_interleave(torch.tensor(counts))
+        rows = (part[which.to(part.device)] for part in (stack.first, stack.top, stack.strides, stack.origin, stack.spacing))
+        return DistanceFields(stack.slopes, stack.curvatures, *rows)
 
     def rows(self, index: slice | Int[Tensor, " k"]) -> DistanceFields:
         """The fields of some of the rows."""

@@ -44,9 +44,11 @@ def apply_to_cloud(T: Float[Tensor, "*#b 4 4"], cloud: Float[Tensor, "*#b n 3"])
 
 def compose(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 4 4"]:
     """The pose with this rotation and this translation."""
-    # torch.broadcast_shapes would import sympy, and takes longer.
-    batch = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
-    top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
+    if rotation.shape[:-1] != translation.shape:
+        # torch.broadcast_shapes would import sympy, and takes longer.
+        batch = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
+        rotation, translation = rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)
+    top = torch.cat([rotation, translation[..., None]], -1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 3] = 1
     return torch.cat([top, bottom], -2)

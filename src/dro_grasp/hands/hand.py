@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,6 +29,9 @@ STORED_AS = {"opening_signs": "opening", "contact_links": "touching"}  # Fields 
 DERIVED = {"fingers", "rigid_group", "thumb"}  # Fields that follow from the others; training bundles do not hold them
 
 
+Kept = TypeVar("Kept")
+
+
 @dataclass(frozen=True)
 class Segments:
     """The points of each registrable link, padded to one length."""
@@ -37,7 +41,7 @@ class Segments:
     weight: Float[Tensor, "l p"]  # 1, or 0 where padded
     local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
 
-    def to(self, like: Tensor) -> Segments:
+    def to(self, like: Float[Tensor, "..."]) -> Segments:
         """The same on the device, and in the precision, of a tensor."""
         return Segments(self.links.to(like.device), self.index.to(like.device), self.weight.to(like), self.local.to(like))
 
@@ -91,6 +95,17 @@ class Hand:
 
     def __repr__(self) -> str:
         return f"Hand('{self.name}', {self.tree.n_dof} joints, {len(self.fingers)} fingers, {self.n_points} surface points)"
+
+    def kept(self, key: object, make: Callable[[], Kept]) -> Kept:
+        """What `make` returns, which is made once for this hand and key."""
+        table = vars(self).setdefault("_kept", {})
+        if key not in table:
+            table[key] = make()
+        return table[key]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to other processes: without what is made again there, perhaps on another device."""
+        return {name: value for name, value in vars(self).items() if name != "_kept"}
 
     @property
     def tips(self) -> tuple[int, ...]:
@@ -204,6 +219,9 @@ class Hand:
 
     def limited_to_use(self) -> Hand:
         """The same hand, whose joints have their open and closed ends as limits; this hand if they do already."""
+        return self.kept("limited", self._limited)
+
+    def _limited(self) -> Hand:
         if torch.equal(self.lower, self.tree.lower) and torch.equal(self.upper, self.tree.upper):
             return self
         return dataclasses.replace(self, tree=dataclasses.replace(self.tree, lower=self.lower, upper=self.upper))
@@ -295,9 +313,8 @@ class Hand:
 
     def to(self, device: torch.device | str) -> Hand:
         """The same hand with its tensors on another device; this hand if they are there already."""
-        if torch.empty(0, device=device).device == self.link_points.device:  # "cuda" is the current one of several
-            return self
-        return on_device(self, device)
+        place = torch.empty(0, device=device).device  # "cuda" is the current one of several
+        return self if place == self.link_points.device else self.kept(("to", place), lambda: on_device(self, device))
 
     def grasp_centres(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
         """The grasp centre of hands at the given wrist poses [m]."""
@@ -315,8 +332,10 @@ class Hand:
         """
         if not 0 < count <= self.n_points:
             raise OptionError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
-        if count == self.n_points:
-            return self
+        return self if count == self.n_points else self.kept(("points", count), lambda: self._thinned(count))
+
+    def _thinned(self, count: int) -> Hand:
+        """The same, where that is fewer."""
         rank = self.spread_rank
         per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.point_links))))
         first = torch.zeros(self.n_points, dtype=torch.bool, device=rank.device)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dro_grasp.devices import at_once, may_hold, where_any
+from dro_grasp.devices import at_once, may_hold, repeat, where_any
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -74,8 +74,9 @@ def closed_fingers(
 ) -> Float[Tensor, "n n_dof"]:
     """The same for wrist poses and joints on the energy's device, where they stay."""
     size, bends = at_once(energy.device, ON_CPU, EACH, config.batch_size), bending(energy.hand)
+    samples = at_once(energy.device, 1, EACH * min(size, len(q)) / config.steps, config.batch_size and config.steps)
     parts = [slice(start, start + size) for start in range(0, len(q), size)]
-    return torch.cat([_Closer(energy.rows(part), bends, T[part], config).close(q[part]) for part in parts])
+    return torch.cat([_Closer(energy.rows(part), bends, T[part], config, samples).close(q[part]) for part in parts])
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class _Closer:
     bends: Bool[Tensor, "n_tips n_dof"]
     T: Float[Tensor, "n 4 4"]
     config: ClosingConfig
+    samples: int  # of a path, which are computed at once
 
     def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
         """Joints with idle fingers closed, and the outer links of the others wrapped around the object."""
@@ -116,13 +118,21 @@ class _Closer:
         some, now, still = replace(self, energy=self.energy.rows(rows), T=self.T[rows]), q[rows], waiting[rows]
         start, moving = start[rows], moving[rows]
         share, meets = some.first_contact(start, moving)
-        overlap = some.overlap(now)
-        for finger in range(len(self.bends)):
-            tried = (meets & still)[:, finger]
-            if may_hold(tried):
-                new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), now)
-                now, overlap, kept = some.moved_apart(now, new, overlap, tried)
-                still = still & ~(kept[:, None] & self.own(finger))
+        moves = meets & still
+
+        def step(
+            state: tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]], finger: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]]:
+            now, overlap, still = state
+            tried = moves.index_select(1, finger)[:, 0]
+            if not may_hold(tried):
+                return state
+            closed = some.along(start, moving.index_select(1, finger)[:, 0], share.index_select(1, finger))
+            new = torch.where(some.bends.index_select(0, finger), closed, now)
+            now, overlap, kept = some.moved_apart(now, new, overlap, tried)
+            return now, overlap, still & ~(kept[:, None] & some.own(finger))
+
+        now, _, still = repeat(step, (now, some.overlap(now), still), len(self.bends))
         if isinstance(rows, Tensor):
             now, still = q.index_put((rows,), now), waiting.index_put((rows,), still)
         return now, still
@@ -140,19 +150,26 @@ class _Closer:
         wanted = (self.bent(q, bends) * active).sum(1) / active.sum(1).clamp_min(1)
         shares, counted = self.bent(q, moving), self.moved(moving)
         waiting = waiting & moving.any(-1) & (wanted[:, None] > shares)
-        overlap = self.overlap(q)
-        for finger in range(len(bends)):
-            for part in config.rest_shares:
-                if not may_hold(waiting[:, finger]):
-                    break
-                share = torch.lerp(shares[:, finger], wanted, part)
-                new = torch.where(moving[:, finger], self.along(opened, moving[:, finger], share[:, None]), q)
-                clear = self.gaps(new, counted[:, finger, None])[:, 0] > config.contact
-                q, overlap, kept = self.moved_apart(q, new, overlap, waiting[:, finger] & clear)
-                waiting = waiting & ~(kept[:, None] & self.own(finger))
-        return q
+        parts, count = q.new_tensor(config.rest_shares), len(config.rest_shares)
 
-    def own(self, finger: int) -> Bool[Tensor, " n_tips"]:
+        def step(
+            state: tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]], number: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]]:
+            q, overlap, waiting = state
+            finger, part = number // count, parts.index_select(0, number % count)
+            tried = waiting.index_select(1, finger)[:, 0]
+            if not may_hold(tried):
+                return state
+            moved = moving.index_select(1, finger)[:, 0]
+            share = torch.lerp(shares.index_select(1, finger), wanted[:, None], part)
+            new = torch.where(moved, self.along(opened, moved, share), q)
+            clear = self.gaps(new, counted.index_select(1, finger))[:, 0] > config.contact
+            q, overlap, kept = self.moved_apart(q, new, overlap, tried & clear)
+            return q, overlap, waiting & ~(kept[:, None] & self.own(finger))
+
+        return repeat(step, (q, self.overlap(q), waiting), count * len(bends))[0]
+
+    def own(self, finger: int | Int[Tensor, "1"]) -> Bool[Tensor, " n_tips"]:
         """Which of the fingers is this one."""
         return torch.arange(len(self.bends), device=self.bends.device) == finger
 
@@ -179,22 +196,23 @@ class _Closer:
         """The share of the way at which what moves of each finger meets the object, and whether it does; all close at once."""
         config, every = self.config, moving.any(1)
         shares = torch.linspace(0, 1, config.steps, device=start.device)
-        counted, several = self.moved(moving), at_once(start.device, 1, EACH * len(start) / config.steps, self.together)
-        near = torch.cat([self.along_path(start, every, some, counted) <= config.contact for some in shares.split(several)])
+        counted = self.moved(moving)
+        near = torch.cat([
+            self.along_path(start, every, some, counted) <= config.contact for some in shares.split(self.samples)])
         first = near.float().argmax(0)
         meets = near.any(0) & (first > 0)  # a path that begins in the object meets nothing
         low, high = shares[(first - 1).clamp_min(0)], shares[first]
         owner = moving.float().argmax(1)  # the finger that each joint moves
-        for _ in range(config.halvings):
+
+        def step(
+            ends: tuple[Float[Tensor, "n n_tips"], Float[Tensor, "n n_tips"]], number: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_tips"], Float[Tensor, "n n_tips"]]:
+            low, high = ends
             middle = (low + high) / 2
             inside = self.gaps(self.along(start, every, middle.gather(1, owner)), counted) <= config.contact
-            high, low = torch.where(inside, middle, high), torch.where(inside, low, middle)
-        return low, meets
+            return torch.where(inside, low, middle), torch.where(inside, middle, high)
 
-    @property
-    def together(self) -> int | None:
-        """Samples of a path that are computed at once: all, where the caller says how many grasps are."""
-        return None if self.config.batch_size is None else self.config.steps
+        return repeat(step, (low, high), config.halvings)[0], meets
 
     def along_path(
         self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_dof"], shares: Float[Tensor, " s"],

@@ -25,6 +25,7 @@ from dro_grasp.optimize.contacts import (
     ContactCandidates,
     ContactConfig,
     LinkPoints,
+    LinkSpheres,
     contact_candidates,
     link_spheres,
     tip_links,
@@ -218,8 +219,9 @@ class Evaluation(Rows):
     clearance: Float[Tensor, "n 1"]
     """Weighted penetration into the surroundings, and touch beside the contact region. It says nothing about the grasp itself,
     so it is not among the terms."""
-    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]
+    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its pivot [1/rad]
     by_joint: Float[Tensor, "n n_dof"]
+    pivot: Float[Tensor, "n 3"]  # the hand's grasp centre [m]
 
     @property
     def total(self) -> Float[Tensor, " n"]:
@@ -240,6 +242,28 @@ class Workspace:
         return Workspace(around, None if self.contact_region is None else on_device(self.contact_region, device))
 
 
+class _HandParts(NamedTuple):
+    """What an energy needs of a hand, whatever the object."""
+
+    hand: Hand
+    candidates: ContactCandidates
+    spheres: LinkSpheres
+    one_hot: Float[Tensor, "n_links n_links"]
+    contact_points: LinkPoints
+    ball: LinkPoints
+    pairs: energies.SpherePairs
+
+    @staticmethod
+    def of(hand: Hand, contacts: ContactConfig | None, device: torch.device) -> _HandParts:
+        """Of a hand on the CPU, on a device."""
+        candidates, spheres = on_device(contact_candidates(hand, contacts), device), on_device(link_spheres(hand), device)
+        own, n_links = hand.to(device), hand.tree.n_links
+        return _HandParts(
+            own, candidates, spheres, torch.eye(n_links, dtype=own.tree.origin.dtype, device=device),
+            LinkPoints.of(candidates.points, candidates.links, n_links), LinkPoints.of(spheres.centres, spheres.links, n_links),
+            energies.SpherePairs.of(spheres.radii, spheres.pairs))
+
+
 class GraspEnergy:
     """The energy of a hand on an object, prepared for many evaluations."""
 
@@ -253,14 +277,9 @@ class GraspEnergy:
         of the evaluations; all that is given is on the CPU.
         """
         self._place(field, centre, length, workspace or Workspace(), device)
-        self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
-        self.spheres = on_device(link_spheres(hand), device)
-        self.source, hand = hand, hand.to(device)
-        self.hand = hand
-        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
-        self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
-        self.pairs = energies.SpherePairs.of(self.spheres.radii, self.spheres.pairs)
-        self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
+        parts = hand.kept(("energy", contacts, self.device), lambda: _HandParts.of(hand, contacts, self.device))
+        self.source, self.hand, self.candidates, self.spheres = hand, parts.hand, parts.candidates, parts.spheres
+        self.one_hot, self.contact_points, self.ball, self.pairs = parts.one_hot, parts.contact_points, parts.ball, parts.pairs
         self._weigh(config or EnergyConfig())
 
     def on(self, obj: ObjectModel, workspace: Workspace) -> GraspEnergy:
@@ -350,17 +369,25 @@ class GraspEnergy:
         other.contact_points = LinkPoints.of(candidates.points, candidates.links, self.hand.tree.n_links)
         return other
 
+    def _spread_points(self, count: int) -> LinkPoints:
+        """So many of the hand's surface points, spread evenly, on the device."""
+        def make() -> LinkPoints:
+            thin = self.source.with_points(min(count, self.source.n_points)).to(self.device)
+            return LinkPoints.of(thin.link_points, thin.link_index, thin.tree.n_links)
+
+        return self.source.kept(("spread", count, self.device), make)
+
     def _weigh(self, config: EnergyConfig) -> None:
         hand = self.hand
-        thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
-        self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        self.config, self.body = config, self._spread_points(config.hand_points)
+        self.solid = self.source.kept(
+            ("solid", config.hand_points, self.device), lambda: self.body.beside(self.ball))
         margin = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
         self.clearance = None
         if self.workspace.surroundings is not None:
-            few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
-            body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
             self.clearance = Clearance(
-                hand, self.workspace.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+                hand, self.workspace.surroundings, self._spread_points(config.clearance_points), self.ball, self.spheres.radii,
+                config.clear, config.clearance)
         place = self.workspace.contact_region
         self.region_term = None if place is None else ContactRegionTerm(place, config.clear)
         self.lower = torch.where(hand.opening_signs > 0, hand.lower + margin, hand.lower)
@@ -387,8 +414,8 @@ class GraspEnergy:
         """Energy and gradient of hands whose links are at these poses [m]."""
         tree, config = self.hand.tree, self.config
         contact_terms, pulled, wrenches = self._contacts(poses, contacts)
-        body = self.body.place(poses)
-        distance, gradient = self.field.distances(body)
+        # Surface points and spheres are placed, and their distances looked up, as one.
+        (body, spheres), (distance, sphere_distance), (gradient, sphere_gradient) = self._distances(poses)
         inside = energies.penetration(distance - config.margin, gradient)
         beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
         if self.region_term is not None:
@@ -396,12 +423,10 @@ class GraspEnergy:
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
             beside = beside + pulled
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
-        spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.pairs)
         depth, by_sphere = inside.value.sum(-1), config.self_penetration * own.by_point
         if config.filled:
-            distance, gradient = self.field.distances(spheres)
-            pierced = energies.penetration(distance - self.spheres.radii, gradient)
+            pierced = energies.penetration(sphere_distance - self.spheres.radii, sphere_gradient)
             depth, by_sphere = depth + pierced.value.sum(-1), by_sphere + config.penetration * pierced.by_point
         wrenches = wrenches + energies.link_wrenches(spheres, by_sphere, self.ball.members)
         beyond, slope = energies.joint_margin(q, self.lower, self.upper)
@@ -420,7 +445,13 @@ class GraspEnergy:
         if self.clearance is not None:
             near = self.clearance(T_object_wrist, q, poses, pivot)
             beside, by_pose, by_joint = beside + near.value, by_pose + near.by_pose, by_joint + near.by_joint
-        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype))
+        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype), pivot)
+
+    def _distances(self, poses: Float[Tensor, "n n_links 4 4"]) -> tuple[tuple[Float[Tensor, "..."], ...], ...]:
+        """Surface points and centres of spheres [m], their signed distances [m], and the gradients of these."""
+        placed, sizes = self.solid.place(poses), [len(self.body.members), len(self.ball.members)]
+        distance, gradient = self.field.distances(placed)
+        return placed.split(sizes, 1), distance.split(sizes, 1), gradient.split(sizes, 1)
 
     def nearest_contacts(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf

@@ -397,7 +397,7 @@ class PinchEnergy:
         by_pose, by_joint = energies.joint_gradient(self.hand.tree, poses, wrenches, self.pivot(T))
         terms = base.terms.index_add(1, torch.tensor([1, 4]), torch.stack([apart, facing], 1))
         return Evaluation(terms, base.clearance, base.by_pose + by_pose,
-                          base.by_joint + by_joint * self.hand.movable.to(q.dtype))
+                          base.by_joint + by_joint * self.hand.movable.to(q.dtype), base.pivot)
 
 
 GRAVITY = 9.81  # [m/s^2]

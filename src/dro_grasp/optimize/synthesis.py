@@ -269,7 +269,7 @@ def propose(
     scale = 1 / squares.sqrt().clamp_min(1e-3)
     move, turn = (-pace * state.result.by_pose * scale[:, :6]).split(3, -1)
     bend = -pace * state.result.by_joint * scale[:, 6:]
-    T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
+    T = turned_about(state.T, state.result.pivot, config.translation_step * move, config.rotation_step * turn)
     hand = energy.hand
     q = (state.q + config.joint_step * hand.tree.joint_unit * bend).clamp(hand.lower, hand.upper)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))

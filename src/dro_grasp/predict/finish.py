@@ -181,9 +181,9 @@ def finish_all(
     else:
         settled = _settled(problems, refined, keep, config, config.settle, watch)
     seconds = {name: spent / len(problems) for name, spent in watch.seconds.items()}
-    done = [Finished(
-        problem, config, keep, own.grasps, admitted[i][own.rows], refined[i], len(candidates[i]) + candidates[i].turned, dropped[i],
-        dict(seconds), own.doubts) for i, (problem, own) in enumerate(zip(problems, settled, strict=True))]
+    made = [len(own) + own.turned for own in candidates]
+    done = [Finished(problem, config, keep, own.grasps, admitted[i][own.rows], refined[i], made[i], dropped[i], dict(seconds),
+                     own.doubts) for i, (problem, own) in enumerate(zip(problems, settled, strict=True))]
     return done if rivals is None else [own if other is None else own.beside(other) for own, other in zip(
         done, rivals, strict=True)]
 

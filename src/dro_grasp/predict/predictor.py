@@ -279,9 +279,10 @@ class _Asking:
 
     def rounds(self, first: Source | None, rescue: Source | None) -> Iterator[_Ask]:
         """What is asked for, one after the other; before the next is asked for, `take` is called with what came."""
+        hand = self.problem.hand
         for source in (first, rescue):
-            if source is not None and not source.knows(self.problem.hand):
-                raise OptionError(f"source '{source.name}' does not know hand '{self.problem.hand.name}'; choose another source")
+            if source is not None and not source.knows(hand):
+                raise OptionError(f"source '{source.name}' does not know hand '{hand.name}'; choose another source")
         self.alone = first is None or rescue is None
         if first is not None:
             yield from self.until_enough(first)

@@ -25,6 +25,10 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import simulate
 
 
+Columns = tuple[Float[Tensor, "n ..."], ...]  # Values of n grasps
+Work = Callable[[GraspEnergy, Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"], float], Columns]  # See `_together`
+
+
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones, and opens as the problem asks.
 
@@ -59,12 +63,12 @@ def refine_all(
     """The same for several objects, together where that is quicker."""
     config = config or RefineConfig()
 
-    def work(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], most: float) -> tuple[Tensor, ...]:
+    def work(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], most: float) -> Columns:
         near = replace(config, largest_turn=min(config.largest_turn, most))
-        with one_thread():
+        with one_thread(energy.device):
             q = closed_fingers(energy, T, q, config.closing)
         T, q = descended(energy, T, q, near)
-        with one_thread():
+        with one_thread(energy.device):
             return T, q, *closing_targets(energy, T, q, config.grip)
 
     made = _together(work, problems, batches, config.energy, config.batch_size)
@@ -79,7 +83,7 @@ def grip(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig) -> Gra
 
 def grip_all(problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: RefineConfig) -> list[GraspBatch]:
     """The same for several objects, together where that is quicker."""
-    def work(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], most: float) -> tuple[Tensor, ...]:
+    def work(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], most: float) -> Columns:
         return closing_targets(energy, T, q, config.grip)
 
     made = _together(work, problems, batches, config.energy, config.batch_size)
@@ -89,15 +93,15 @@ def grip_all(problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], co
 
 @torch.no_grad()
 def _together(
-    work: Callable[[GraspEnergy, Tensor, Tensor, float], tuple[Tensor, ...]], problems: Sequence[GraspProblem],
+    work: Work, problems: Sequence[GraspProblem],
     batches: Sequence[GraspBatch], config: EnergyConfig, given: int | None,
-) -> list[tuple[Tensor, ...] | None]:
+) -> list[Columns | None]:
     """What is made of each batch, on the CPU, by work on poses and joints on the device; None for no grasps.
 
     Rows of several objects are computed as one on a device, and wherever a batch size is `given`. The last argument of the work
     is the largest tilt [rad].
     """
-    found: list[tuple[Tensor, ...] | None] = [None] * len(problems)
+    found: list[Columns | None] = [None] * len(problems)
     for problem, grasps in zip(problems, batches, strict=True):
         grasps.require_hand(problem.hand)
     for rows in grouped(problems, [len(grasps) for grasps in batches], given):

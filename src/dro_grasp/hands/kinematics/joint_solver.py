@@ -48,8 +48,10 @@ def read_joints(
     known = torch.zeros(len(tree.moving_names), dtype=torch.bool, device=q.device)
     known[[tree.link_joint[link] for _, _, chain in segments for link in chain]] = True
     longest = max(len(chain) for _, _, chain in segments)
-    places = [torch.tensor([(top, bottom, chain[place]) for top, bottom, chain in segments if len(chain) > place]).T.to(q.device)
-              for place in range(longest)]
+    places = []
+    for place in range(longest):
+        rows = [(top, bottom, chain[place]) for top, bottom, chain in segments if len(chain) > place]
+        places.append(torch.tensor(rows).T.to(q.device))
     for _ in range(1 if longest == 1 else ROUNDS):
         for place in places:
             q = _update(tree, T_world_link, q, known, *place)
@@ -440,14 +442,10 @@ def _problem(
 ) -> _Problem:
     """The problem in double precision, with the batch axes of the targets flattened."""
     positions = targets.positions.reshape(-1, *targets.positions.shape[-2:]).double()
-    coupling = tree.link_coupling
-    pair_link, dof = coupling.nonzero(as_tuple=True)
-    drive = (tree.descends[targets.links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]).T.repeat(1, 3)
-    gather = torch.zeros(tree.n_dof, len(dof), dtype=coupling.dtype, device=coupling.device)
-    gather[dof, torch.arange(len(dof), device=dof.device)] = 1
-    same = gather.shape[0] == gather.shape[1] and bool((gather.diagonal() == 1).all())
+    pairs = tree.pairs
+    drive = (tree.descends[targets.links][:, pairs.link].to(pairs.rate.dtype) * pairs.rate).T.repeat(1, 3)
     return _Problem(
-        tree, targets.links, targets.local.double(), drive, pair_link, None if same else gather, positions, lower, upper
+        tree, targets.links, targets.local.double(), drive, pairs.link, pairs.gather, positions, lower, upper
     )
 
 

@@ -112,7 +112,8 @@ def propose(
     return propose_all([problem], network, [num], [generator], config or ProposalConfig(), watch or Stopwatch(), progress)[0]
 
 
-ON_CPU, DECODED_ON_CPU = 4, 16  # Candidates that pass a CPU's network at once, and that it decodes at once (ours, timed)
+ON_CPU = 4  # Candidates that pass the network at once on a CPU: more do not fit its cache (ours, timed)
+DECODED_ON_CPU = 16  # Candidates that a CPU decodes at once (ours, timed)
 COPIES = 8  # Copies of its largest tensors that the network needs (ours, counted)
 
 
@@ -147,7 +148,7 @@ def propose_all(
         field = joined if isinstance(joined, DistanceField) else joined.rows(slice(rivals * start, rivals * part.stop))
         own = inputs.rows(part)
         distances = _distances(first, network, clouds, own, field, config, watch)
-        with watch("decode"), one_thread():
+        with watch("decode"), one_thread(first.device):
             links = distance_matrix.decode(hand, distances, clouds[own.which])
             solution = distance_matrix.solve(hand.limited_to_use(), links, own.joints)
             found.append((solution.T_world_wrist, solution.joints, links.points))
@@ -223,12 +224,12 @@ def _placements(
     offered = wanted if surroundings is None else max(wanted, CHOICES * num)
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
     rotations = wrist_rotations(hand, max(count, config.prior_choices * offered), direction, spread, generator, up)
-    opened = hand.points(hand.canonical_joints())
-    rotation, position = network.sample_placements(
-        cloud, rotations @ axes, offered, generator, proportions(hand, axes))
+    measures = hand.kept(("proportions", network.config.frame), lambda: proportions(hand, axes))
+    rotation, position = network.sample_placements(cloud, rotations @ axes, offered, generator, measures)
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:
+        opened = hand.points(hand.canonical_joints())
         lack = approach_cost(hand, placed, opened, None if max_tilt else direction, surroundings)
         best = lack.argsort(stable=True)[:wanted]
         rotation, offset = rotation[best] @ axes.mT, offset[best]
