@@ -141,13 +141,18 @@ def repeat(step: Callable[[State, Int[Tensor, "1"]], State], state: State, times
     then repeats the graph, so that launches cost nothing. What cannot be captured is launched each time.
     """
     first = _leaves(state)[0]
-    if first.device.type == "cuda" and times >= FEWEST_CAPTURED and (graph := _captured(step, state)) is not None:
+    if _captures(first.device) and times >= FEWEST_CAPTURED and (graph := _captured(step, state)) is not None:
         for _ in range(times):
             graph.replay()
         return graph.state
     for number in range(times):
         state = step(state, torch.full((1,), number, device=first.device))
     return state
+
+
+def _captures(device: torch.device) -> bool:
+    """Whether a device knows graphs."""
+    return device.type == "cuda"
 
 
 @dataclasses.dataclass(frozen=True)

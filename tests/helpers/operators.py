@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -23,15 +25,30 @@ class Operators(TorchDispatchMode):
     def __init__(self, device: str) -> None:
         super().__init__()
         self.device = torch.device(device).type
+        Operators.counting = True
         self.count = 0
         """Operators, views included."""
         self.waits: Counter[str] = Counter()
         """Those that wait for the device, with the line of the package from which they come."""
 
+    counting = True
+
+    @staticmethod
+    @contextmanager
+    def paused() -> Iterator[None]:
+        """Within the block, nothing is counted."""
+        Operators.counting = False
+        try:
+            yield
+        finally:
+            Operators.counting = True
+
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         places = [x.device.type for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
         asked = kwargs.get("device")
+        if not Operators.counting:
+            return operation(*args, **kwargs)
         if self.device in places or (asked is not None and torch.device(asked).type == self.device):
             self.count += 1
             if self._waits(operation, places, asked, args):

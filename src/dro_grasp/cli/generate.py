@@ -157,15 +157,17 @@ class Generate:
                 found.append(self._ready(job, name, next((f.problem for f in found if isinstance(f, Ready)), None)))
             except DroGraspError as error:
                 found.append(error)
-        ready, begin = [each for each in found if isinstance(each, Ready)], time.perf_counter()
+        ready: list[Ready] = [each for each in found if isinstance(each, Ready)]
+        begin = time.perf_counter()
         problems: list[GraspProblem] = [each.problem for each in ready]
         with progress_bar("predicting", self.json) as progress:
             made = iter(job.predictor.run_many(problems, job.request, progress) if problems else [])
         share = (time.perf_counter() - begin) / max(1, len(ready))
         results: list[Predicted | DroGraspError] = []
         for each in found:
-            own = each if isinstance(each, DroGraspError) else next(made)
-            results.append(own if isinstance(own, DroGraspError) else Predicted(each.problem, own, each.seconds, share))
+            own = next(made) if isinstance(each, Ready) else each
+            results.append(Predicted(each.problem, own, each.seconds, share) if isinstance(each, Ready) and not isinstance(
+                own, DroGraspError) else own)
         return results
 
     def _ready(self, job: Job, name: str, first: GraspProblem | None) -> Ready:

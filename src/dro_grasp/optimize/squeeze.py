@@ -114,7 +114,7 @@ def _middle(energy: GraspEnergy, near: NearestPoints, touches: Bool[Tensor, "n l
 
 
 def _beside_points(length: float | Float[Tensor, "n 1"]) -> float | Float[Tensor, "n 1 1"]:
-    return length if isinstance(length, float) else length[..., None]
+    return length[..., None] if isinstance(length, Tensor) else length
 
 
 def contact_forces(

@@ -108,7 +108,9 @@ class GraspProblem:
     @property
     def field(self) -> DistanceField:
         """Signed distances of the object, on the device."""
-        return self._default_energy.field
+        field = self._default_energy.field
+        assert isinstance(field, DistanceField)
+        return field
 
     @property
     def workspace(self) -> Workspace:

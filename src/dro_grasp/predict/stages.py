@@ -24,7 +24,6 @@ from dro_grasp.predict.score.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import simulate
 
-
 Columns = tuple[Float[Tensor, "n ..."], ...]  # Values of n grasps
 Work = Callable[[GraspEnergy, Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"], float], Columns]  # See `_together`
 

@@ -137,8 +137,9 @@ def propose_all(
     with watch("network"):
         drawn = [_drawn(network, *each, rivals, draws, config) for each in zip(problems, counts, generators, strict=True)]
         clouds = torch.stack([cloud for cloud, _ in drawn])
-        inputs = _Inputs(*(torch.cat([getattr(own, f.name) for _, own in drawn]) for f in fields(_Inputs) if f.name != "which"),
-                         torch.arange(len(problems)).repeat_interleave(torch.tensor(counts)).to(first.device))
+        which = torch.arange(len(problems)).repeat_interleave(torch.tensor(counts)).to(first.device)
+        parts = {f.name: torch.cat([getattr(own, f.name) for _, own in drawn]) for f in fields(_Inputs)}
+        inputs = _Inputs(**parts | {"which": which})
         joined = first.field if len(problems) == 1 else DistanceFields.of(
             [problem.field for problem in problems], [rivals * count for count in counts])
     size = at_once(first.device, DECODED_ON_CPU, _decoding_bytes(network), config.batch_size)
