@@ -164,6 +164,7 @@ class _Graph:
 
 
 _WARM: set[Any] = set()  # Code of the steps that ran before: libraries set themselves up at first use, which is not captured
+_CAPTURING = threading.Lock()  # What another thread launches on the stream meanwhile would become part of the graph
 
 
 def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) -> _Graph | None:
@@ -174,7 +175,7 @@ def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) ->
     stream, graph = _capture_stream(device), torch.cuda.CUDAGraph()
     stream.wait_stream(torch.cuda.current_stream(device))
     try:
-        with torch.cuda.stream(stream):
+        with _CAPTURING, torch.cuda.stream(stream):
             if step.__code__ not in _WARM:
                 step(kept, number)
                 _WARM.add(step.__code__)

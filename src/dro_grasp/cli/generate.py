@@ -165,9 +165,12 @@ class Generate:
         share = (time.perf_counter() - begin) / max(1, len(ready))
         results: list[Predicted | DroGraspError] = []
         for each in found:
-            own = next(made) if isinstance(each, Ready) else each
-            results.append(Predicted(each.problem, own, each.seconds, share) if isinstance(each, Ready) and not isinstance(
-                own, DroGraspError) else own)
+            if not isinstance(each, Ready):
+                results.append(each)
+            elif isinstance(own := next(made), DroGraspError):
+                results.append(own)
+            else:
+                results.append(Predicted(each.problem, own, each.seconds, share))
         return results
 
     def _ready(self, job: Job, name: str, first: GraspProblem | None) -> Ready:
