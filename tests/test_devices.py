@@ -9,7 +9,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.devices import choose_device, cores, on_device, require_device, side_by_side
+from dro_grasp.devices import (
+    at_once,
+    choose_device,
+    cores,
+    may_hold,
+    on_device,
+    repeat,
+    require_device,
+    side_by_side,
+    where_any,
+)
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.grasp_energy import link_spheres
@@ -115,3 +125,35 @@ def test_cores_are_at_most_the_threads_that_are_wanted(monkeypatch: pytest.Monke
     for wanted, expected in (("3", 3), ("16", 8), ("0", 8), ("many", 8), ("", 8)):
         monkeypatch.setenv("OMP_NUM_THREADS", wanted)
         assert cores() == expected
+
+
+def test_batches_follow_the_device_and_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert at_once("cpu", 32, 1e6) == 32
+    assert at_once("cpu", 32, 1e6, given=7) == 7
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (60 * 2**30, 80 * 2**30))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 5 * 2**30)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 1 * 2**30)
+    assert at_once("cuda", 32, 2**20) == int(0.4 * 64 * 2**10)
+    assert at_once("cuda", 32, 2**40) == 32
+    assert at_once("cuda", 32, 1e6, given=7) == 7
+
+
+def test_a_step_that_is_repeated_is_told_its_number(device: str) -> None:
+    table = torch.tensor([1.0, 10.0, 100.0, 1000.0, 1e4]).to(device)
+
+    def step(state: tuple[torch.Tensor, torch.Tensor], number: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        total, last = state
+        return total + table.index_select(0, number), 2 * last + total
+
+    begin = (torch.zeros(1).to(device), torch.ones(1).to(device))
+    total, last = repeat(step, begin, 5)
+    assert (total.item(), last.item()) == (11111.0, 32.0 + 8 * 1 + 4 * 11 + 2 * 111 + 1111)
+    assert (begin[0].item(), begin[1].item()) == (0.0, 1.0)
+
+
+def test_no_more_is_waited_for_than_the_cpu_s_own(device: str) -> None:
+    mask = torch.tensor([False, True, True])
+    assert where_any(mask).tolist() == [1, 2]
+    assert where_any(mask.to(device)) == slice(None)
+    assert not may_hold(torch.zeros(2, dtype=torch.bool))
+    assert may_hold(torch.zeros(2, dtype=torch.bool).to(device))

@@ -1,11 +1,12 @@
 """Prediction, synthesis and training on a GPU, beside the processor in the same run.
 
-Hands and objects are built in. Everything is timed once it is warm. Prediction is `generate` with candidates of the network
-alone; trials always run on the processor and are not part of it. The paper-size network has random weights, whose distances fit
-no grasp, so its decoding takes longer than that of a trained one. Synthesis is the optimiser's descent, without trials.
-Training is a step of the preset with its own number of object points, in bfloat16 where `--mixed` would be given.
+Hands and objects are built in. Prediction is of candidates of the network alone: many of one pair, some of many pairs of one
+hand, and the four of which one grasp is chosen, by stage, with settling and without. The first run, which captures graphs, is
+told apart. Many pairs are of sixteen objects, each of which comes four times as an object of its own. Synthesis is the
+optimiser's descent, without trials. Training is a step of the preset with its own number of object points, in bfloat16 where
+`--mixed` would be given.
 
-    python -m lab.benchmarks.device [--device cuda] [--bundle FILE] [--quick] [--json]
+    python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis] [--bundle FILE] [--quick] [--json]
 """
 
 from __future__ import annotations
@@ -17,18 +18,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from dro_grasp.devices import require_device
 from dro_grasp.hands.library import load_hand
-from dro_grasp.network.checkpoints import DEFAULT, save_weights
-from dro_grasp.network.network import untrained_network
 from dro_grasp.network.presets import NetworkConfig
-from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.problem import problems_of
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
 from dro_grasp.training.loop import train
@@ -36,8 +40,12 @@ from lab.benchmarks.report import emit
 
 HAND, OBJECT = "allegro", "rubber_duck"
 REPETITIONS = 3
-PREDICTIONS = {"cpu": (1, 16), "gpu": (1, 16, 256)}
-DESCENTS = {"cpu": (128,), "gpu": (128, 1024, 4096)}
+PREDICTIONS = {"cpu": ((1, 16, 1), (1, 1, 4)), "gpu": ((1, 1024, 1), (64, 16, 1), (1, 1, 4))}
+"""Pairs, grasps of each, and candidates of each grasp."""
+STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
+SETTLED = (False, True)  # Whether candidates close in simulation, on the processor
+DISTINCT = 16  # Objects of which many pairs are made
+DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 BATCHES = {"cpu": ((4, 4),), "gpu": ((4, 4), (8, 32), (8, 128))}
 """Hands a step and samples of each."""
 TRAINED = {"multi": (48, False), "paper": (128, True)}
@@ -57,22 +65,47 @@ def median(run: Callable[[], object], repetitions: int) -> float:
     return statistics.median(times[1:])
 
 
-def predictions(device: str, weights: dict[str, str], repetitions: int) -> list[list[object]]:
-    """Rows of predictions: what, how many at once, and seconds of each part for one."""
-    hand, obj, rows = load_hand(HAND), load_object(OBJECT), []
-    for label, path in weights.items():
-        predictor = GraspPredictor(path, device)
-        for num in PREDICTIONS[kind(device)]:
-            parts: list[dict[str, float]] = []
+def objects(count: int) -> list[ObjectModel]:
+    """Built-in training objects; where that is more than there are or more than DISTINCT, some come again."""
+    if count == 1:
+        return [load_object(OBJECT)]
+    found = [load_object(name) for name in resolve_objects(["builtin:train"])[:DISTINCT]]
+    with ThreadPoolExecutor() as pool:  # their distances are computed once
+        fields = list(pool.map(lambda obj: obj.distance_field, found))
+    again = []
+    for i in range(count):
+        obj = replace(found[i % len(found)])
+        vars(obj)["distance_field"] = replace(fields[i % len(found)])
+        again.append(obj)
+    return again
 
-            def run(predictor: GraspPredictor = predictor, num: int = num, parts: list[dict[str, float]] = parts) -> None:
-                request = GraspRequest(num, len(parts), candidates=1, source="network", least_confidence=0.0)
-                parts.append(dict(predictor.run(GraspProblem(hand, obj, device), request).seconds))
 
-            whole = median(run, repetitions)
-            network = statistics.median(p["network"] + p["choose"] + p["decode"] for p in parts[1:])
-            rows.append(said([f"prediction, {label}", device, num, 1e3 * whole / num, 1e3 * network / num, num / whole]))
+def predictions(device: str, repetitions: int) -> list[list[object]]:
+    """Rows of predictions: what, milliseconds of each stage for one candidate, and candidates a second."""
+    hand, rows = load_hand(HAND), []
+    for pairs, num, candidates in PREDICTIONS[kind(device)]:
+        models = objects(pairs)
+        for settled in SETTLED:
+            finish = FinishConfig() if settled else FinishConfig(settle=None)
+            predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
+            request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)
+            count, runs = pairs * num * candidates, []
+            # Closing on the processor takes most of the time, and is timed once.
+            for seed in range(1 + (1 if settled and count > SLOW else repetitions)):
+                begin = time.perf_counter()
+                made = predictor.run_many(
+                    problems_of(hand, models, device, Constraints()), replace(request, seed=seed))
+                stages = {name: sum(one.seconds[name] for one in made if not isinstance(one, Exception)) for name in STAGES}
+                runs.append((time.perf_counter() - begin, stages))
+            whole = statistics.median(seconds for seconds, _ in runs[1:])
+            parts = [statistics.median(stages[name] for _, stages in runs[1:]) for name in STAGES]
+            what = f"{pairs} x {num} x {candidates}, {'settled' if settled else 'scored'}"
+            rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{1e3 * part / count:.3f}" for part in parts),
+                              f"{1e3 * whole / count:.3f}", count / whole]))
     return rows
+
+
+SLOW = 100  # Candidates from which on closing on the processor is timed once
 
 
 def descents(device: str, repetitions: int) -> list[list[object]]:
@@ -81,7 +114,7 @@ def descents(device: str, repetitions: int) -> list[list[object]]:
     config = SynthesisConfig(device=device)
     for num in DESCENTS[kind(device)]:
         seconds = median(lambda num=num: synthesize(hand, obj, num, 0, config), repetitions)
-        rows.append(said(["synthesis, candidates", device, num, 1e3 * seconds / num, "", num / seconds]))
+        rows.append(said([f"synthesis, {num} candidates", device, *BLANK, f"{1e3 * seconds / num:.3f}", num / seconds]))
     return rows
 
 
@@ -99,7 +132,7 @@ def training(device: str, bundle: Bundle) -> list[list[object]]:
                 seconds = [json.loads(line)["seconds"] for line in (Path(folder) / "log.jsonl").read_text().splitlines()]
             step = (seconds[-1] - seconds[WARM_UP - 1]) / (len(seconds) - WARM_UP)
             count = hands * samples
-            rows.append(said([f"training, {preset}", device, count, 1e3 * step / count, "", count / step]))
+            rows.append(said([f"training, {preset}, {count}", device, *BLANK, f"{1e3 * step / count:.3f}", count / step]))
     return rows
 
 
@@ -119,25 +152,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor")
     parser.add_argument("--bundle", type=Path, help="training bundle, for the speed of training")
+    parser.add_argument("--only", default="prediction,synthesis,training", help="what is measured, by commas")
     parser.add_argument("--quick", action="store_true", help="one repetition")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     require_device(options.device)
-    repetitions = 1 if options.quick else REPETITIONS
+    repetitions, only = 1 if options.quick else REPETITIONS, options.only.split(",")
     rows: list[list[object]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "paper.safetensors"
-        save_weights(untrained_network(NetworkConfig.preset("paper"), 0, "paper"), path)
-        for device in dict.fromkeys(("cpu", options.device)):
-            rows += predictions(device, {"default weights": DEFAULT, "paper size": str(path)}, repetitions)
+    for device in dict.fromkeys(("cpu", options.device)):
+        if "prediction" in only:
+            rows += predictions(device, repetitions)
+        if "synthesis" in only:
             rows += descents(device, repetitions)
-            if options.bundle:
-                rows += training(device, load_bundle(options.bundle))
+        if options.bundle and "training" in only:
+            rows += training(device, load_bundle(options.bundle))
     emit(
-        f"{HAND} and {OBJECT}: median of {repetitions}; times for each grasp, candidate or sample", rows,
-        ["what", "device", "at once", "[ms]", "network and decoding [ms]", "a second"],
-        {f"{what} {device} {num}": float(str(rate)) for what, device, num, *_, rate in rows}, options.json,
+        f"{HAND} and {OBJECT}, or 64 objects; pairs x grasps x candidates: median of {repetitions}; milliseconds for each "
+        "candidate or sample", rows, ["what", "device", "first run [s]", *STAGES, "whole", "a second"],
+        {f"{what} {device}": float(str(rate)) for what, device, *_, rate in rows}, options.json,
     )
+
+
+BLANK = [""] * (1 + len(STAGES))  # Columns that only predictions have
 
 
 if __name__ == "__main__":

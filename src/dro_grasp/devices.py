@@ -13,13 +13,14 @@ from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
 Result = TypeVar("Result")
 Record = TypeVar("Record")
+State = TypeVar("State")
 
 
 def choose_device(name: str) -> str:
@@ -47,14 +48,23 @@ def cores() -> int:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Within the block, PyTorch computes in one thread: several add to the CPU time of a task, and wait for each other."""
+def one_thread(device: torch.device | str = "cpu") -> Iterator[None]:
+    """Within the block, PyTorch computes in one thread: several add to the CPU time of a task, and wait for each other.
+
+    Nothing changes for work on another device.
+    """
+    if on_accelerator(device):
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+OTHER = "meta"  # Any device that is not the CPU
 
 
 def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
@@ -66,7 +76,7 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
     jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
     on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
     if min(len(jobs), threads) < 2 or not on_cpu:
-        with one_thread():
+        with one_thread("cpu" if on_cpu else OTHER):
             return [work(*job) for job in jobs]
 
     def prepare() -> None:  # both settings belong to a thread
@@ -75,6 +85,134 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
 
     with one_thread(), ThreadPoolExecutor(threads, initializer=prepare) as pool:
         return list(pool.map(lambda job: work(*job), jobs))
+
+
+MEMORY_SHARE = 0.4
+"""Share of a device's free memory that one batch may take (ours); the rest is for what is kept, and for errors of estimates."""
+UNKNOWN_MEMORY = 4 * 2**30
+"""Free memory of a device that does not tell it [bytes] (ours)."""
+
+
+def at_once(device: torch.device | str, on_cpu: int, each: float, given: int | None = None) -> int:
+    """How many things are computed at once.
+
+    Args:
+        device: Where.
+        on_cpu: How many suit the cache of a processor; at least as many are computed at once elsewhere.
+        each: Memory that one of them takes [bytes].
+        given: What the caller asked for, which decides.
+    """
+    if given is not None:
+        return given
+    device = torch.device(device)
+    if device.type == "cpu":
+        return on_cpu
+    free = float(UNKNOWN_MEMORY)
+    if device.type == "cuda":
+        # What PyTorch holds without using it is free as well.
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        free = torch.cuda.mem_get_info(device)[0] + cached
+    return max(on_cpu, int(MEMORY_SHARE * free / each))
+
+
+def on_accelerator(device: torch.device | str) -> bool:
+    """Whether a device is not the CPU."""
+    return torch.device(device).type != "cpu"
+
+
+def where_any(mask: Bool[Tensor, " n"]) -> Int[Tensor, " k"] | slice:
+    """Rows for which a mask holds; on a device, which would have to be waited for, all of them."""
+    return mask.nonzero()[:, 0] if mask.device.type == "cpu" else slice(None)
+
+
+def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
+    """Whether a mask holds anywhere; on a device, which would have to be waited for, yes."""
+    return bool(mask.any()) if mask.device.type == "cpu" else True
+
+
+FEWEST_CAPTURED = 4
+"""Fewer repetitions than these are not captured (ours): to capture a step takes as long as to launch it twice."""
+
+
+def repeat(step: Callable[[State, Int[Tensor, "1"]], State], state: State, times: int) -> State:
+    """The state after a step that is taken many times, and is told its number.
+
+    The step computes with tensors alone and waits for none of them. CUDA launches it once, as it is captured in a graph, and
+    then repeats the graph, so that launches cost nothing. What cannot be captured is launched each time.
+    """
+    first = _leaves(state)[0]
+    if _captures(first.device) and times >= FEWEST_CAPTURED and (graph := _captured(step, state)) is not None:
+        for _ in range(times):
+            graph.replay()
+        return graph.state
+    for number in range(times):
+        state = step(state, torch.full((1,), number, device=first.device))
+    return state
+
+
+def _captures(device: torch.device) -> bool:
+    """Whether a device knows graphs."""
+    return device.type == "cuda"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Graph:
+    """A captured step, which takes what is in `state` and leaves its result there."""
+
+    state: Any
+    replay: Callable[[], None]
+
+
+_WARM: set[Any] = set()  # Code of the steps that ran before: libraries set themselves up at first use, which is not captured
+_CAPTURING = threading.Lock()  # What another thread launches on the stream meanwhile would become part of the graph
+
+
+def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) -> _Graph | None:
+    """The step as a graph, which begins at a state; None if CUDA refuses."""
+    kept = _rebuilt(state, iter([leaf.clone() for leaf in _leaves(state)]))
+    device = _leaves(kept)[0].device
+    number = torch.zeros(1, dtype=torch.int64, device=device)
+    stream, graph = _capture_stream(device), torch.cuda.CUDAGraph()
+    stream.wait_stream(torch.cuda.current_stream(device))
+    try:
+        with _CAPTURING, torch.cuda.stream(stream):
+            if step.__code__ not in _WARM:
+                step(kept, number)
+                _WARM.add(step.__code__)
+            graph.capture_begin(capture_error_mode="thread_local")
+            try:
+                for old, new in zip(_leaves(kept), _leaves(step(kept, number)), strict=True):
+                    old.copy_(new)
+                number += 1
+            finally:
+                graph.capture_end()
+    except RuntimeError:
+        return None
+    torch.cuda.current_stream(device).wait_stream(stream)
+    return _Graph(kept, graph.replay)
+
+
+@cache
+def _capture_stream(device: torch.device) -> torch.cuda.Stream:
+    """The stream on which steps are captured: each stream keeps memory of its own."""
+    return torch.cuda.Stream(device)
+
+
+def _leaves(value: Any) -> list[Shaped[Tensor, "..."]]:
+    """The tensors of a tensor, a tuple, or a record of them."""
+    if isinstance(value, Tensor):
+        return [value]
+    parts = value if isinstance(value, tuple) else [getattr(value, f.name) for f in dataclasses.fields(value)]
+    return [leaf for part in parts for leaf in _leaves(part)]
+
+
+def _rebuilt(like: Any, leaves: Iterator[Shaped[Tensor, "..."]]) -> Any:
+    """Such a value of other tensors."""
+    if isinstance(like, Tensor):
+        return next(leaves)
+    if isinstance(like, tuple):
+        return tuple(_rebuilt(part, leaves) for part in like)
+    return type(like)(*(_rebuilt(getattr(like, f.name), leaves) for f in dataclasses.fields(like)))
 
 
 def fast_products() -> AbstractContextManager[None]:

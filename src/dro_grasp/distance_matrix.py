@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.geometry.multilateration import MultilaterationConfig, SideConfig, choose_sides, distance_misfit, multilaterate
 from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, register
-from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.hand import Hand, Segments
 from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, read_joints, solve_joints
 from dro_grasp.kinds import Checked
 
@@ -46,16 +46,6 @@ class LinkPoses:
         return on_device(self, device)
 
 
-@dataclass(frozen=True)
-class _Segments:
-    """The points of each registrable link, padded to one length."""
-
-    links: Int[Tensor, " l"]
-    index: Int[Tensor, "l p"]  # rows of the hand cloud; 0 where padded
-    weight: Float[Tensor, "l p"]  # 1, or 0 where padded
-    local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
-
-
 def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
     """D(R,O) of a posed hand and an object [m]."""
     return point_distances(hand_points, object_points)
@@ -72,7 +62,7 @@ def decode(
     config = config or DecodeConfig()
     batch, (n, m) = distances.shape[:-2], distances.shape[-2:]
     distances, object_points = distances.reshape(-1, n, m), object_points.reshape(-1, m, 3)
-    segments = _segments(hand, distances.device, distances.dtype)
+    segments = hand.segments.to(distances)
     both, flat = multilaterate(distances, object_points, config.multilateration)
     points = both[:, 0]
     if bool(flat.any()):
@@ -88,19 +78,8 @@ def decode(
                      points.reshape(*batch, n, 3))
 
 
-def _segments(hand: Hand, device: torch.device, dtype: torch.dtype) -> _Segments:
-    """The hand's points grouped by link."""
-    links = hand.registrable.nonzero()[:, 0]
-    rows = [(hand.link_index == link).nonzero()[:, 0] for link in links]
-    index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
-    lengths = torch.tensor([len(row) for row in rows])
-    weight = (torch.arange(index.shape[1]) < lengths[:, None]).to(device, dtype)
-    local = hand.link_points[index].to(device, dtype)
-    return _Segments(links.to(device), index.to(device), weight, local)
-
-
 def _sides(
-    hand: Hand, segments: _Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
+    hand: Hand, segments: Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
     object_points: Float[Tensor, "b m 3"], config: DecodeConfig,
 ) -> Bool[Tensor, "b n"]:
     """Whether each hand point takes its second candidate, for grasps of flat objects."""

@@ -93,14 +93,15 @@ def test_the_former_option_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_grasps_carry_is_told(
     generate, weights: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = GraspPredictor.run
+    run_many = GraspPredictor.run_many
 
-    def carrying(*arguments: Any) -> Prediction:
-        made = run(*arguments)
+    def carrying(*arguments: Any) -> list[Prediction]:
+        made, = run_many(*arguments)
+        assert isinstance(made, Prediction)
         payload, force = torch.tensor([0.8, torch.nan, 0.034]), torch.tensor([6.25, 31.0, torch.nan])
-        return dataclasses.replace(made, grasps=made.grasps.replace(payload=payload, squeeze_force=force))
+        return [dataclasses.replace(made, grasps=made.grasps.replace(payload=payload, squeeze_force=force))]
 
-    monkeypatch.setattr(GraspPredictor, "run", carrying)
+    monkeypatch.setattr(GraspPredictor, "run_many", carrying)
     report = generate("--protocol", "none")
     assert (report["payload"], report["squeeze_force"]) == (pytest.approx([0.8, None, 0.034]), [6.25, 31.0, None])
     assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "3", "--source",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import DistanceField, DistanceFields
 
 SPACING = 0.003
 HALF = 0.09
@@ -74,3 +74,18 @@ def test_a_field_has_the_precision_of_its_values():
     values = sphere(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1))
     field = DistanceField.from_values(values, torch.full((3,), -0.01), 0.005)
     assert field.normals(torch.zeros(2, 3, dtype=torch.float64)).bend.dtype == torch.float64
+
+
+def test_each_row_of_stacked_fields_sees_its_own():
+    fields = [bake(shape) for shape in (sphere, box, cylinder)]
+    points = 0.12 * torch.rand(6, 5, 2, 3, dtype=fields[0].slopes.dtype, generator=torch.Generator().manual_seed(0)) - 0.06
+    stacked = DistanceFields.of([fields[0], fields[2], fields[0], fields[1]], [1, 2, 1, 2])
+    order = [0, 2, 2, 0, 1, 1]
+    assert len(stacked.slopes) == sum(len(field.slopes) for field in fields)
+    for rows in (slice(None), slice(1, 5)):
+        found = stacked.rows(rows).normals(points[rows])
+        for k, i in enumerate(range(6)[rows]):
+            for value, expected in zip(found, fields[order[i]].normals(points[i]), strict=True):
+                torch.testing.assert_close(value[k], expected)
+            distance, gradient = stacked.rows(rows).distances(points[rows])
+            torch.testing.assert_close((distance[k], gradient[k]), fields[order[i]].distances(points[i]))

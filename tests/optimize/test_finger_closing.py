@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +10,7 @@ import torch
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimize.fingers import ClosingConfig, close_idle_fingers
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.optimize.terms import SpherePairs
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import toy_hand
 
@@ -118,7 +118,7 @@ def test_an_outer_link_that_meets_nothing_bends_as_the_fingers_that_hold() -> No
 def test_fingers_do_not_close_into_each_other() -> None:
     """Fingers of 6 cm in radius, which overlap when they close: spheres stand for the links."""
     energy = copy(ENERGY)
-    energy.spheres = replace(ENERGY.spheres, radii=torch.full_like(ENERGY.spheres.radii, 0.06))
+    energy.pairs = SpherePairs.of(torch.full_like(ENERGY.spheres.radii, 0.06), ENERGY.spheres.pairs)
     before = grasp(-0.3, 0.2, 0.1, 0.62, 0.1, 0.62)
     assert torch.equal(close_idle_fingers(energy, before).joints, before.joints)
     careless = close_idle_fingers(energy, before, ClosingConfig(overlap=1.0))

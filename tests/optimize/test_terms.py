@@ -97,7 +97,8 @@ def test_alignment_is_zero_where_the_normals_oppose():
 
 @pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
 def test_links_that_may_all_touch_do_not_penetrate(batch: tuple[int, ...]):
-    term = energies.self_penetration(torch.rand(*batch, 4, 3), torch.ones(4), torch.empty(0, 2, dtype=torch.long))
+    term = energies.self_penetration(
+        torch.rand(*batch, 4, 3), energies.SpherePairs.of(torch.ones(4), torch.empty(0, 2, dtype=torch.long)))
     assert term.value.shape == (*batch, 0)
     assert torch.equal(term.by_point, torch.zeros(*batch, 4, 3))
 
@@ -105,11 +106,11 @@ def test_links_that_may_all_touch_do_not_penetrate(batch: tuple[int, ...]):
 def test_self_penetration_gradient_and_value():
     centres, radii = random(2, 5, 3, scale=0.02), torch.full((5,), 0.02, dtype=torch.float64)
     pairs = torch.combinations(torch.arange(5), 2)
-    term = energies.self_penetration(centres, radii, pairs)
-    by_point = numeric(lambda c: energies.self_penetration(c, radii, pairs).value.sum(-1), centres)
+    term = energies.self_penetration(centres, energies.SpherePairs.of(radii, pairs))
+    by_point = numeric(lambda c: energies.self_penetration(c, energies.SpherePairs.of(radii, pairs)).value.sum(-1), centres)
     torch.testing.assert_close(term.by_point, by_point, rtol=1e-6, atol=1e-6)
     two = torch.tensor([[0.0, 0, 0], [0.03, 0, 0]], dtype=torch.float64)
-    overlap = energies.self_penetration(two, radii[:2], torch.tensor([[0, 1]])).value
+    overlap = energies.self_penetration(two, energies.SpherePairs.of(radii[:2], torch.tensor([[0, 1]]))).value
     torch.testing.assert_close(overlap, torch.tensor([0.01], dtype=torch.float64))  # [m]
 
 

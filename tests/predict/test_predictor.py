@@ -403,14 +403,14 @@ def test_the_best_candidates_are_varied_where_no_source_is_named(predictor: Gras
     problem, asked = GraspProblem(HAND, ball), rescuing(predictor, (math.inf,) * 3, 20, 40)
     request = GraspRequest(2, seed=1, source="auto")
     made: Counter[str] = Counter()
-    finish = predictor_module.finish
+    finish_all = predictor_module.finish_all
 
-    def noting(problem: GraspProblem, candidates: Candidates, *rest: Any) -> Finished:
-        made.update(candidates.origin)
-        return finish(problem, candidates, *rest)
+    def noting(problems: list[GraspProblem], candidates: list[Candidates], *rest: Any) -> list[Finished]:
+        made.update(candidates[0].origin)
+        return finish_all(problems, candidates, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predictor_module, "finish", noting)
+        patch.setattr(predictor_module, "finish_all", noting)
         given = asked.run(problem, request)
         assert made == {"network": 48, "optimiser": 40, "variation": 40}
         assert set(given.origin) <= set(made)

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
@@ -16,16 +16,18 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from dro_grasp.errors import DroGraspError
     from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.predict.config import GraspRequest
     from dro_grasp.predict.constraints import Constraints
-    from dro_grasp.predict.predictor import GraspPredictor
+    from dro_grasp.predict.predictor import GraspPredictor, Prediction
     from dro_grasp.predict.problem import GraspProblem
 
 ROWS_SHOWN = 16  # Grasps listed in the table
+TOGETHER = 64  # Objects of a folder that a GPU predicts together (ours): their distances fill some gigabytes
 
 
 @dataclass(frozen=True)
@@ -90,14 +92,17 @@ class Generate:
             names, outputs, pictures, job = self._prepare()
         several = names != [self.object]
         done, failed = [], []
-        for name, output, picture in zip(names, outputs, pictures, strict=True):
-            try:
-                done.append(self._grasp(job, name, output, picture))
-            except DroGraspError as error:
-                if not several:
-                    raise
-                say_aside(f"error: {name}: {error}")
-                failed.append({"object": name, "error": str(error)})
+        for part in self._parts(list(zip(names, outputs, pictures, strict=True))):
+            for (name, output, picture), made in zip(part, self._predict(job, [name for name, *_ in part]), strict=True):
+                try:
+                    if isinstance(made, DroGraspError):
+                        raise made
+                    done.append(self._finish(job, made, name, output, picture))
+                except DroGraspError as error:
+                    if not several:
+                        raise
+                    say_aside(f"error: {name}: {error}")
+                    failed.append({"object": name, "error": str(error)})
         if self.json:
             print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
         if self.view:
@@ -135,18 +140,48 @@ class Generate:
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
         return names, outputs, pictures, Job(hand, predictor, request, constraints, camera, seconds)
 
-    def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
-        """One object, start to end."""
-        from dro_grasp.compare.metrics import success_rate
+    def _parts(self, jobs: list[Any]) -> list[list[Any]]:
+        """Objects that are predicted together: one by one on the CPU."""
+        from dro_grasp.devices import on_accelerator
+
+        size = TOGETHER if on_accelerator(self.device) else 1
+        return [jobs[start : start + size] for start in range(0, len(jobs), size)]
+
+    def _predict(self, job: Job, names: list[str]) -> list[Predicted | DroGraspError]:
+        """What is predicted of each object, or why there is nothing."""
+        from dro_grasp.errors import DroGraspError
+
+        found: list[Any] = []
+        for name in names:
+            try:
+                found.append(self._ready(job, name, next((f.problem for f in found if isinstance(f, Ready)), None)))
+            except DroGraspError as error:
+                found.append(error)
+        ready: list[Ready] = [each for each in found if isinstance(each, Ready)]
+        begin = time.perf_counter()
+        problems: list[GraspProblem] = [each.problem for each in ready]
+        with progress_bar("predicting", self.json) as progress:
+            made = iter(job.predictor.run_many(problems, job.request, progress) if problems else [])
+        share = (time.perf_counter() - begin) / max(1, len(ready))
+        results: list[Predicted | DroGraspError] = []
+        for each in found:
+            if not isinstance(each, Ready):
+                results.append(each)
+            elif isinstance(own := next(made), DroGraspError):
+                results.append(own)
+            else:
+                results.append(Predicted(each.problem, own, each.seconds, share))
+        return results
+
+    def _ready(self, job: Job, name: str, first: GraspProblem | None) -> Ready:
+        """An object, read and cut, as a problem beside the first of its part."""
         from dro_grasp.errors import OptionError
-        from dro_grasp.grasps.sources import with_sources
         from dro_grasp.predict.problem import GraspProblem
-        from dro_grasp.simulation.outcome import count_failures, next_steps
 
         begin = time.perf_counter()
         with progress_bar(f"reading {Path(name).name}", self.json):
             obj = self._load(name, job.camera)
-        seconds = {**job.seconds, "load": job.seconds["load"] + time.perf_counter() - begin}
+        seconds = time.perf_counter() - begin
         if self.only_successful and self._protocol(obj) == "none":
             raise OptionError(f"--only-successful saves what passed a trial, and '{obj.name}' gets none; name a "
                               "--protocol, which needs a mesh, or leave out --only-successful")
@@ -154,10 +189,18 @@ class Generate:
             say_aside(f"{obj.name}: {note}")
         if (warning := self._warning(job, obj)) is not None:
             say_aside(f"warning: {obj.name}: {warning}")
-        problem = GraspProblem(job.hand, obj, self.device, job.constraints)
+        problem = GraspProblem(job.hand, obj, self.device, job.constraints) if first is None else first.beside(obj)
         self._cut(obj)
-        with progress_bar("predicting", self.json) as progress:
-            made = job.predictor.run(problem, job.request, progress)
+        return Ready(problem, seconds)
+
+    def _finish(self, job: Job, predicted: Predicted, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
+        """Trials, files and report of one object."""
+        from dro_grasp.compare.metrics import success_rate
+        from dro_grasp.grasps.sources import with_sources
+        from dro_grasp.simulation.outcome import count_failures, next_steps
+
+        problem, made, begin = predicted.problem, predicted.made, time.perf_counter()
+        obj, seconds = problem.obj, {**job.seconds, "load": job.seconds["load"] + predicted.load}
         if made.shortage is not None:
             say_aside(f"warning: {obj.name}: {made.shortage}")
         middle = time.perf_counter()
@@ -190,7 +233,8 @@ class Generate:
 
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept, picture)
-        seconds |= {"files": time.perf_counter() - middle, "total": sum(job.seconds.values()) + time.perf_counter() - begin}
+        total = sum(job.seconds.values()) + predicted.load + predicted.share + time.perf_counter() - begin
+        seconds |= {"files": time.perf_counter() - middle, "total": total}
         report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)
@@ -276,6 +320,22 @@ class Generate:
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
                 say(f"{what}: {report[key]}")
+
+
+class Ready(NamedTuple):
+    """An object that was read."""
+
+    problem: GraspProblem
+    seconds: float  # that reading took [s]
+
+
+class Predicted(NamedTuple):
+    """What was predicted of an object."""
+
+    problem: GraspProblem
+    made: Prediction
+    load: float  # time of reading it [s]
+    share: float  # and of predicting, of those that were predicted together an equal share [s]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from dro_grasp.devices import repeat
 
 
 def nonnegative_least_squares(
@@ -21,14 +23,27 @@ def nonnegative_least_squares(
     hessian = a.mT @ a + ridge * torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
     slope = a.mT @ b
     step = 1 / hessian.abs().sum(-1).amax(-1)[:, None, None]  # at most one over the largest eigenvalue
-    x = torch.zeros_like(slope)
-    ahead, momentum = x, 1.0
-    for _ in range(iterations):
+    pull = _momenta(iterations, slope)
+
+    def advance(
+        state: tuple[Float[Tensor, "n k *c"], Float[Tensor, "n k *c"]], number: Int[Tensor, "1"]
+    ) -> tuple[Float[Tensor, "n k *c"], Float[Tensor, "n k *c"]]:
+        x, ahead = state
         new = (ahead - step * (hessian @ ahead - slope)).clamp_min(0)
+        return new, new + pull.index_select(0, number) * (new - x)
+
+    none = torch.zeros_like(slope)
+    return repeat(advance, (none, none), iterations)[0]
+
+
+def _momenta(iterations: int, like: Float[Tensor, "..."]) -> Float[Tensor, " iterations"]:
+    """How far each iteration looks ahead, as a share of its step."""
+    momentum, found = 1.0, []
+    for _ in range(iterations):
         following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
-        ahead = new + (momentum - 1) / following * (new - x)
-        x, momentum = new, following
-    return x
+        found.append((momentum - 1) / following)
+        momentum = following
+    return torch.tensor(found, dtype=torch.float64).to(like)
 
 
 def friction_cone(inward: Float[Tensor, "*n 3"], friction: float, edges: int) -> Float[Tensor, "*n edges 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -60,34 +61,129 @@ class DistanceField:
                 curvature.select(axis, end).zero_()
         return curvature.flatten(-2).flatten(0, 2).contiguous()
 
+    @cached_property
+    def _top(self) -> Float[Tensor, "3"]:
+        """Place of the last voxel along each axis."""
+        return self.origin.new_tensor(self.shape) - 1
+
+    @cached_property
+    def _strides(self) -> Float[Tensor, "3"]:
+        """Rows between neighbours along each axis."""
+        return self.origin.new_tensor([self.shape[1] * self.shape[2], self.shape[2], 1])
+
     def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Signed distance [m] and its gradient: nearest voxel and first order; linear beyond the grid."""
-        row, offset = self._locate(points)
-        near = self.slopes.index_select(0, row.flatten()).reshape(*points.shape[:-1], 4)
-        gradient = near[..., 1:]
-        return near[..., 0] + (gradient * offset).sum(-1), gradient
+        return _first_order(self.slopes, *self._locate(points))
 
     def normals(self, points: Float[Tensor, "*b 3"]) -> SurfaceModel:
         """Second-order model at the nearest voxel; each part is the exact derivative of the one before."""
-        row, offset = self._locate(points)
-        near, curvature = self.slopes[row], self.curvatures[row].unflatten(-1, (3, 3))
-        gradient = near[..., 1:]
-        turned = (curvature @ offset[..., None])[..., 0]
-        distance = near[..., 0] + (gradient * offset).sum(-1) + 0.5 * (turned * offset).sum(-1)
-        raw = gradient + turned
-        length = raw.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        normal = raw / length
-        tangent = curvature - normal[..., :, None] * (normal[..., None, :] @ curvature)
-        return SurfaceModel(distance, raw, normal, tangent / length[..., None])
+        return _second_order(self.slopes, self.curvatures, *self._locate(points))
 
     def _locate(self, points: Float[Tensor, "*b 3"]) -> tuple[Int[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Row of the nearest voxel, and the offset from its centre [m]."""
         place = (points - self.origin) / self.spacing
-        top = place.new_tensor(self.shape) - 1
-        index = torch.minimum(place.round().clamp_min(0), top)
+        index = torch.minimum(place.round().clamp_min(0), self._top)
         offset = (place - index) * self.spacing
-        strides = place.new_tensor([self.shape[1] * self.shape[2], self.shape[2], 1])
-        return (index @ strides).to(torch.int64), offset
+        return (index * self._strides).sum(-1).to(torch.int64), offset
+
+
+class _Stack(NamedTuple):
+    """Several fields, one after the other; as those of `DistanceFields`, with one row for each field."""
+
+    fields: tuple[DistanceField, ...]
+    slopes: Float[Tensor, "voxels 4"]
+    curvatures: Float[Tensor, "voxels 9"]
+    first: Int[Tensor, " o"]
+    top: Float[Tensor, "o 3"]
+    strides: Float[Tensor, "o 3"]
+    origin: Float[Tensor, "o 3"]
+    spacing: Float[Tensor, " o"]
+
+    @staticmethod
+    def of(fields: Sequence[DistanceField]) -> _Stack:
+        """Stack fields of one device; the first keeps the stack, since stages in turn ask for the same."""
+        kept = vars(fields[0]).get("_stack")
+        if kept is not None and len(kept.fields) == len(fields) and all(map(operator.is_, kept.fields, fields)):
+            return kept
+        device, sizes = fields[0].slopes.device, torch.tensor([0] + [len(field.slopes) for field in fields])
+        slopes, curvatures = (torch.cat([getattr(field, name) for field in fields]) for name in ("slopes", "curvatures"))
+        top, strides, origin = (
+            torch.stack([getattr(field, name) for field in fields]) for name in ("_top", "_strides", "origin"))
+        spacing = torch.tensor([field.spacing for field in fields]).to(origin)
+        made = _Stack(
+            tuple(fields), slopes, curvatures, sizes.cumsum(0)[:-1].to(device), top, strides, origin, spacing)
+        vars(fields[0])["_stack"] = made
+        return made
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceFields:
+    """Fields of several objects, of which each row of points sees one."""
+
+    slopes: Float[Tensor, "voxels 4"]  # of all fields, one after the other
+    curvatures: Float[Tensor, "voxels 9"]
+    first: Int[Tensor, " n"]  # first voxel of each row's field
+    top: Float[Tensor, "n 3"]  # place of the last voxel along each axis
+    strides: Float[Tensor, "n 3"]  # rows between neighbours along each axis
+    origin: Float[Tensor, "n 3"]  # position of the first voxel [m]
+    spacing: Float[Tensor, " n"]  # edge of a voxel [m]
+
+    @staticmethod
+    def of(fields: Sequence[DistanceField], counts: Sequence[int]) -> DistanceFields:
+        """Fields of so many rows each; a field that comes twice is kept once."""
+        own = list({id(field): field for field in fields}.values())
+        place, stack = {id(field): k for k, field in enumerate(own)}, _Stack.of(own)
+        which = torch.tensor([place[id(field)] for field in fields]).repeat_interleave(torch.tensor(counts))
+        rows = (part[which.to(part.device)] for part in (stack.first, stack.top, stack.strides, stack.origin, stack.spacing))
+        return DistanceFields(stack.slopes, stack.curvatures, *rows)
+
+    def rows(self, index: slice | Int[Tensor, " k"]) -> DistanceFields:
+        """The fields of some of the rows."""
+        own = (getattr(self, name)[index] for name in ("first", "top", "strides", "origin", "spacing"))
+        return DistanceFields(self.slopes, self.curvatures, *own)
+
+    def distances(self, points: Float[Tensor, "n *b 3"]) -> tuple[Float[Tensor, "n *b"], Float[Tensor, "n *b 3"]]:
+        """See `DistanceField.distances`."""
+        return _first_order(self.slopes, *self._locate(points))
+
+    def normals(self, points: Float[Tensor, "n *b 3"]) -> SurfaceModel:
+        """See `DistanceField.normals`."""
+        return _second_order(self.slopes, self.curvatures, *self._locate(points))
+
+    def _locate(self, points: Float[Tensor, "n *b 3"]) -> tuple[Int[Tensor, "n *b"], Float[Tensor, "n *b 3"]]:
+        """Row of the nearest voxel, and the offset from its centre [m]."""
+        shape = (len(points), *[1] * (points.ndim - 2))
+        origin, top, strides = (x.view(*shape, 3) for x in (self.origin, self.top, self.strides))
+        spacing = self.spacing.view(*shape, 1)
+        place = (points - origin) / spacing
+        index = torch.minimum(place.round().clamp_min(0), top)
+        offset = (place - index) * spacing
+        return (index * strides).sum(-1).to(torch.int64) + self.first.view(shape), offset
+
+
+def _first_order(
+    slopes: Float[Tensor, "voxels 4"], row: Int[Tensor, "*b"], offset: Float[Tensor, "*b 3"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+    """Signed distance [m] and gradient at an offset from a voxel [m]."""
+    near = slopes.index_select(0, row.flatten()).reshape(*row.shape, 4)
+    gradient = near[..., 1:]
+    return near[..., 0] + (gradient * offset).sum(-1), gradient
+
+
+def _second_order(
+    slopes: Float[Tensor, "voxels 4"], curvatures: Float[Tensor, "voxels 9"], row: Int[Tensor, "*b"],
+    offset: Float[Tensor, "*b 3"],
+) -> SurfaceModel:
+    """The surface as a voxel knows it, at an offset from it [m]."""
+    near, curvature = slopes[row], curvatures[row].unflatten(-1, (3, 3))
+    gradient = near[..., 1:]
+    turned = (curvature @ offset[..., None])[..., 0]
+    distance = near[..., 0] + (gradient * offset).sum(-1) + 0.5 * (turned * offset).sum(-1)
+    raw = gradient + turned
+    length = raw.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    normal = raw / length
+    tangent = curvature - normal[..., :, None] * (normal[..., None, :] @ curvature)
+    return SurfaceModel(distance, raw, normal, tangent / length[..., None])
 
 
 @dataclass(frozen=True, eq=False)

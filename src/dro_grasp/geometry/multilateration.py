@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.devices import at_once
 from dro_grasp.geometry.se3 import apply_to_cloud, register
 from dro_grasp.kinds import Checked
 
@@ -23,7 +24,12 @@ class MultilaterationConfig(Checked):
     max_step: float = 0.05  # longest Gauss-Newton step [m]
     approach_anchors: int = 128
     """All steps but the last two use about so many anchors, evenly from the list: they only approach the minimum."""
-    chunk: int = 4  # clouds that are refined at once: more do not fit into the processor's cache
+    chunk: int | None = None
+    """Clouds that are refined at once; None takes what suits the device."""
+
+
+ON_CPU = 4  # Clouds that are refined at once on a CPU: more do not fit its cache (ours, timed)
+COPIES = 6  # Copies of the distances that a step of the refinement needs (ours, counted)
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,8 @@ def _refine_where(
     rows = chosen.reshape(-1).nonzero()[:, 0]
     start, distances = start.reshape(-1, n, 3), distances.reshape(-1, n, m)
     anchors = cloud.points.reshape(-1, m, 3)
-    parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(config.chunk)]
+    size = at_once(start.device, ON_CPU, COPIES * n * m * start.element_size(), config.chunk)
+    parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(size)]
     return start.index_put((rows,), torch.cat(parts)).reshape(shape)
 
 

@@ -44,10 +44,13 @@ def apply_to_cloud(T: Float[Tensor, "*#b 4 4"], cloud: Float[Tensor, "*#b n 3"])
 
 def compose(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 4 4"]:
     """The pose with this rotation and this translation."""
-    # torch.broadcast_shapes would import sympy, and takes longer.
-    batch = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
-    top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*batch, 1, 4)
+    if rotation.shape[:-1] != translation.shape:
+        # torch.broadcast_shapes would import sympy, and takes longer.
+        batch = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
+        rotation, translation = rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)
+    top = torch.cat([rotation, translation[..., None]], -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
     return torch.cat([top, bottom], -2)
 
 
@@ -61,7 +64,13 @@ def turned_about(
     T: Float[Tensor, "n 4 4"], pivot: Float[Tensor, "n 3"], move: Float[Tensor, "n 3"], turn: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 4 4"]:
     """Poses turned about a pivot by a rotation vector [rad], and then shifted by `move` [m]."""
-    rotation = roma.rotvec_to_rotmat(turn)
+    return rotated_about(T, pivot, move, roma.rotvec_to_rotmat(turn))
+
+
+def rotated_about(
+    T: Float[Tensor, "n 4 4"], pivot: Float[Tensor, "n 3"], move: Float[Tensor, "n 3"], rotation: Float[Tensor, "n 3 3"]
+) -> Float[Tensor, "n 4 4"]:
+    """The same by a rotation matrix."""
     return compose(rotation @ T[:, :3, :3], rotate(rotation, T[:, :3, 3] - pivot) + pivot + move)
 
 

@@ -15,13 +15,17 @@ from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
 
 
-def complete(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
-    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay. `centre` as below."""
+def complete(
+    hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"] | Float[Tensor, "#n 1 3"], config: ControllerConfig | None = None
+) -> GraspBatch:
+    """The same grasps, each with pregrasp and squeeze; rows that are stated stay. `centre` as below."""
     open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):
         return grasps
+    centre = centre.to(grasps.joints)
     made = pregrasp_and_squeeze(
-        hand, grasps.T_object_wrist[open_rows], grasps.joints[open_rows], centre.to(grasps.joints), config)
+        hand, grasps.T_object_wrist[open_rows], grasps.joints[open_rows],
+        centre[open_rows] if len(centre) == len(grasps) and centre.ndim > 1 else centre, config)
     postures = []
     for given, new in zip((grasps.pregrasp_joints, grasps.squeeze_joints), made, strict=True):
         whole = given.clone()
@@ -62,8 +66,7 @@ def distance_slope(
     tree = hand.tree
     poses = T_object_wrist[:, None] @ tree.forward(joints)
     # The mean of each link's points stands for them: the mean distance hardly differs, and links are few.
-    links = hand.link_index.unique()
-    middles = torch.stack([hand.link_points[hand.link_index == link].mean(0) for link in links])
+    links, middles = hand.point_links, hand.link_middles
     points = se3.apply(poses[:, links], middles)
     offset = points - centre
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)

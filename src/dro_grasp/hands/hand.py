@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -26,6 +27,23 @@ MIN_REGISTRATION_POINTS = 4  # Fewest points that determine a link's pose, if th
 POINTS_PER_LINK = 6  # Points that each link keeps, if it has them, when a hand is thinned (ours)
 STORED_AS = {"opening_signs": "opening", "contact_links": "touching"}  # Fields that training bundles hold under another name
 DERIVED = {"fingers", "rigid_group", "thumb"}  # Fields that follow from the others; training bundles do not hold them
+
+
+Kept = TypeVar("Kept")
+
+
+@dataclass(frozen=True)
+class Segments:
+    """The points of each registrable link, padded to one length."""
+
+    links: Int[Tensor, " l"]
+    index: Int[Tensor, "l p"]  # rows of the hand's surface points; 0 where padded
+    weight: Float[Tensor, "l p"]  # 1, or 0 where padded
+    local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
+
+    def to(self, like: Float[Tensor, "..."]) -> Segments:
+        """The same on the device, and in the precision, of a tensor."""
+        return Segments(self.links.to(like.device), self.index.to(like.device), self.weight.to(like), self.local.to(like))
 
 
 @dataclass(frozen=True)
@@ -78,6 +96,17 @@ class Hand:
     def __repr__(self) -> str:
         return f"Hand('{self.name}', {self.tree.n_dof} joints, {len(self.fingers)} fingers, {self.n_points} surface points)"
 
+    def kept(self, key: object, make: Callable[[], Kept]) -> Kept:
+        """What `make` returns, which is made once for this hand and key."""
+        table = vars(self).setdefault("_kept", {})
+        if key not in table:
+            table[key] = make()
+        return table[key]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to other processes: without what is made again there, perhaps on another device."""
+        return {name: value for name, value in vars(self).items() if name != "_kept"}
+
     @property
     def tips(self) -> tuple[int, ...]:
         """Fingertip links, one per finger."""
@@ -128,6 +157,45 @@ class Hand:
         margin = 0.25 * (self.tree.upper - self.tree.lower)
         return torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
 
+    @cached_tensor
+    def pointed_fingers(self) -> Int[Tensor, " k"]:
+        """Indices of the fingers that have surface points."""
+        found = self.finger_of_link[self.link_index].unique()
+        return found[found != PALM]
+
+    @cached_tensor
+    def segments(self) -> Segments:
+        """The surface points of each registrable link."""
+        links = self.registrable.nonzero()[:, 0]
+        rows = [(self.link_index == link).nonzero()[:, 0] for link in links]
+        index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+        lengths = torch.tensor([len(row) for row in rows], device=index.device)
+        weight = (torch.arange(index.shape[1], device=index.device) < lengths[:, None]).to(self.link_points)
+        return Segments(links, index, weight, self.link_points[index])
+
+    @cached_tensor
+    def finger_links(self) -> Bool[Tensor, "n_tips n_links"]:
+        """The links of each finger."""
+        table = torch.zeros(len(self.fingers), self.tree.n_links, dtype=torch.bool)
+        for index, finger in enumerate(self.fingers):
+            table[index, list(finger.links)] = True
+        return table.to(self.link_points.device)
+
+    @cached_tensor
+    def finger_joints(self) -> Bool[Tensor, "n_tips n_dof"]:
+        """The joints that move each finger, alone or with others."""
+        return torch.stack([self.tree.moves[list(finger.links)].any(0) for finger in self.fingers])
+
+    @cached_tensor
+    def point_links(self) -> Int[Tensor, " l"]:
+        """Links that have surface points, ascending."""
+        return self.link_index.unique()
+
+    @cached_tensor
+    def link_middles(self) -> Float[Tensor, "l 3"]:
+        """Mean of the surface points of each of `point_links`, in its frame [m]."""
+        return torch.stack([self.link_points[self.link_index == link].mean(0) for link in self.point_links])
+
     @property
     def n_points(self) -> int:
         """Number of surface points."""
@@ -142,7 +210,7 @@ class Hand:
     def registrable(self) -> Bool[Tensor, " n_links"]:
         """Links whose pose their own points determine."""
         mask = torch.zeros(self.tree.n_links, dtype=torch.bool, device=self.link_points.device)
-        for link in self.link_index.unique().tolist():
+        for link in self.point_links.tolist():
             points = self.link_points[self.link_index == link]
             if len(points) >= MIN_REGISTRATION_POINTS:
                 spread = torch.linalg.svdvals(points - points.mean(0))
@@ -151,6 +219,9 @@ class Hand:
 
     def limited_to_use(self) -> Hand:
         """The same hand, whose joints have their open and closed ends as limits; this hand if they do already."""
+        return self.kept("limited", self._limited)
+
+    def _limited(self) -> Hand:
         if torch.equal(self.lower, self.tree.lower) and torch.equal(self.upper, self.tree.upper):
             return self
         return dataclasses.replace(self, tree=dataclasses.replace(self.tree, lower=self.lower, upper=self.upper))
@@ -242,9 +313,8 @@ class Hand:
 
     def to(self, device: torch.device | str) -> Hand:
         """The same hand with its tensors on another device; this hand if they are there already."""
-        if torch.empty(0, device=device).device == self.link_points.device:  # "cuda" is the current one of several
-            return self
-        return on_device(self, device)
+        place = torch.empty(0, device=device).device  # "cuda" is the current one of several
+        return self if place == self.link_points.device else self.kept(("to", place), lambda: on_device(self, device))
 
     def grasp_centres(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
         """The grasp centre of hands at the given wrist poses [m]."""
@@ -262,12 +332,14 @@ class Hand:
         """
         if not 0 < count <= self.n_points:
             raise OptionError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
-        if count == self.n_points:
-            return self
+        return self if count == self.n_points else self.kept(("points", count), lambda: self._thinned(count))
+
+    def _thinned(self, count: int) -> Hand:
+        """The same, where that is fewer."""
         rank = self.spread_rank
-        per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.link_index.unique()))))
+        per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.point_links))))
         first = torch.zeros(self.n_points, dtype=torch.bool, device=rank.device)
-        for link in self.link_index.unique().tolist():
+        for link in self.point_links.tolist():
             members = (self.link_index == link).nonzero()[:, 0]
             first[members[rank[members].argsort()[:per_link]]] = True
         priority = torch.where(first, rank - self.n_points, rank)

@@ -13,13 +13,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dro_grasp.devices import side_by_side
+from dro_grasp.devices import at_once, side_by_side
 
 MIN_SCALE = 0.003  # Smallest standard deviation of a mixture component [m]. Source: ours
 LENGTH = 0.1  # Unit of length inside the network, about the size of an object [m]. Source: ours
 SCALE = 0.03  # Unit of the components' standard deviations inside the network [m]. Source: ours
 ROTATIONS_PER_PART = 16
-"""Rotations whose hidden layers exist at a time: those of more do not fit a processor's cache. Source: ours, timed."""
+"""Rotations whose hidden layers exist at a time on a CPU: those of more do not fit its cache. Source: ours, timed."""
+COPIES = 3  # Copies of the largest hidden layer that a rotation needs. Source: ours, counted
 COLDEST = 1e-3  # Lower temperatures choose components as this one does: the heaviest. Source: ours
 PROPORTIONS = 72  # Numbers of a hand's proportions (`dro_grasp.hands.proportions`)
 LEAST_SPREAD = 0.05  # Smallest spread of a proportion over hands: less tells hands apart by chance. Source: ours
@@ -99,8 +100,9 @@ class PlacementPrior(nn.Module):
         Returns:
             Rotations, and positions in the hand's axes about the object's centre [m].
         """
-        parts = side_by_side(
-            lambda some: self(obj @ some, hand.expand(len(some), -1)), rotations.split(ROTATIONS_PER_PART))
+        each = 4.0 * COPIES * len(obj) * self.points[-1].out_features
+        size = at_once(obj.device, ROTATIONS_PER_PART, each)
+        parts = side_by_side(lambda some: self(obj @ some, hand.expand(len(some), -1)), rotations.split(size))
         logits, mean, scale, score = (torch.cat(values) for values in zip(*parts, strict=True))
         # The largest of (log-probability + Gumbel noise) is a draw from the distribution; the n largest, n without repetition.
         chosen = (score + gumbel(score.shape, generator).to(score)).topk(num).indices

@@ -34,6 +34,10 @@ class LinkPoints:
         layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
         return LinkPoints(layout, members)
 
+    def beside(self, others: LinkPoints) -> LinkPoints:
+        """These points, and then others."""
+        return LinkPoints(torch.cat([self.layout, others.layout], 1), torch.cat([self.members, others.members]))
+
     def place(self, poses: Float[Tensor, "n n_links 4 4"]) -> Float[Tensor, "n p 3"]:
         """The points in the world [m]."""
         rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.devices import at_once, may_hold, repeat, where_any
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -43,8 +44,12 @@ class ClosingConfig(Checked):
     """Shares of the way to the bend of the fingers that hold; an idle finger rests at the first at which it has room."""
     overlap: float = 0.001
     """Largest growth of a grasp's self-penetration [m]."""
-    batch_size: int = 64
-    """Grasps closed at once."""
+    batch_size: int | None = None
+    """Grasps closed at once; None takes what suits the device."""
+
+
+ON_CPU = 64  # Grasps closed or opened at once on a CPU (ours, timed)
+EACH = 2e6  # Memory of a grasp: the surface points of all samples of its fingers' paths [bytes] (ours, counted)
 
 
 @torch.no_grad()
@@ -56,14 +61,22 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     bent as far as the fingers that hold, on average.
     Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
     """
-    config = config or ClosingConfig()
     if not len(grasps):
         return grasps
-    device = energy.centre.device
-    parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
-    bends = bending(energy.hand)
-    ends = [_Closer(energy, bends, T.to(device), config).close(q.to(device)) for T, q in parts]
-    return grasps.with_poses(grasps.T_object_wrist, torch.cat(ends).cpu())
+    device = energy.device
+    ends = closed_fingers(energy, grasps.T_object_wrist.to(device), grasps.joints.to(device), config or ClosingConfig())
+    return grasps.with_poses(grasps.T_object_wrist, ends.cpu())
+
+
+@torch.no_grad()
+def closed_fingers(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: ClosingConfig
+) -> Float[Tensor, "n n_dof"]:
+    """The same for wrist poses and joints on the energy's device, where they stay."""
+    size, bends = at_once(energy.device, ON_CPU, EACH, config.batch_size), bending(energy.hand)
+    samples = at_once(energy.device, 1, EACH * min(size, len(q)) / config.steps, config.batch_size and config.steps)
+    parts = [slice(start, start + size) for start in range(0, len(q), size)]
+    return torch.cat([_Closer(energy.rows(part), bends, T[part], config, samples).close(q[part]) for part in parts])
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,7 @@ class _Closer:
     bends: Bool[Tensor, "n_tips n_dof"]
     T: Float[Tensor, "n 4 4"]
     config: ClosingConfig
+    samples: int  # of a path, which are computed at once
 
     def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
         """Joints with idle fingers closed, and the outer links of the others wrapped around the object."""
@@ -98,18 +112,30 @@ class _Closer:
         waiting: Bool[Tensor, "n n_tips"],
     ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
         """Joints with those waiting fingers on the object that meet it on their way from `start`, and which still wait."""
-        rows = waiting.any(1)
-        if not bool(rows.any()):
+        rows = where_any(waiting.any(1))
+        if isinstance(rows, Tensor) and not len(rows):
             return q, waiting
-        some, now, still = replace(self, T=self.T[rows]), q[rows], waiting[rows]
+        some, now, still = replace(self, energy=self.energy.rows(rows), T=self.T[rows]), q[rows], waiting[rows]
         start, moving = start[rows], moving[rows]
         share, meets = some.first_contact(start, moving)
-        for finger in (meets & still).any(0).nonzero()[:, 0].tolist():
-            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), now)
-            kept = (meets & still)[:, finger] & some.keeps_apart(new, now)
-            now = torch.where(kept[:, None], new, now)
-            still[:, finger] &= ~kept
-        return q.index_put((rows,), now), waiting.index_put((rows,), still)
+        moves = meets & still
+
+        def step(
+            state: tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]], finger: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]]:
+            now, overlap, still = state
+            tried = moves.index_select(1, finger)[:, 0]
+            if not may_hold(tried):
+                return state
+            closed = some.along(start, moving.index_select(1, finger)[:, 0], share.index_select(1, finger))
+            new = torch.where(some.bends.index_select(0, finger), closed, now)
+            now, overlap, kept = some.moved_apart(now, new, overlap, tried)
+            return now, overlap, still & ~(kept[:, None] & some.own(finger))
+
+        now, _, still = repeat(step, (now, some.overlap(now), still), len(self.bends))
+        if isinstance(rows, Tensor):
+            now, still = q.index_put((rows,), now), waiting.index_put((rows,), still)
+        return now, still
 
     def rest(
         self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"], waiting: Bool[Tensor, "n n_tips"],
@@ -120,20 +146,32 @@ class _Closer:
         opened = torch.where(bends.any(0), hand.canonical_joints(1.0), q)
         active = active & bends.any(1)
         if hand.thumb is not None:
-            active[:, hand.thumb] = False  # it bends otherwise than the fingers that it opposes
+            active = active & ~self.own(hand.thumb)  # it bends otherwise than the fingers that it opposes
         wanted = (self.bent(q, bends) * active).sum(1) / active.sum(1).clamp_min(1)
         shares, counted = self.bent(q, moving), self.moved(moving)
         waiting = waiting & moving.any(-1) & (wanted[:, None] > shares)
-        for finger in waiting.any(0).nonzero()[:, 0].tolist():
-            for part in config.rest_shares:
-                if not bool(waiting[:, finger].any()):
-                    break
-                share = torch.lerp(shares[:, finger], wanted, part)
-                new = torch.where(moving[:, finger], self.along(opened, moving[:, finger], share[:, None]), q)
-                kept = waiting[:, finger] & (self.gaps(new, counted)[:, finger] > config.contact) & self.keeps_apart(new, q)
-                q = torch.where(kept[:, None], new, q)
-                waiting[:, finger] &= ~kept
-        return q
+        parts, count = q.new_tensor(config.rest_shares), len(config.rest_shares)
+
+        def step(
+            state: tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]], number: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, "n n_tips"]]:
+            q, overlap, waiting = state
+            finger, part = number // count, parts.index_select(0, number % count)
+            tried = waiting.index_select(1, finger)[:, 0]
+            if not may_hold(tried):
+                return state
+            moved = moving.index_select(1, finger)[:, 0]
+            share = torch.lerp(shares.index_select(1, finger), wanted[:, None], part)
+            new = torch.where(moved, self.along(opened, moved, share), q)
+            clear = self.gaps(new, counted.index_select(1, finger))[:, 0] > config.contact
+            q, overlap, kept = self.moved_apart(q, new, overlap, tried & clear)
+            return q, overlap, waiting & ~(kept[:, None] & self.own(finger))
+
+        return repeat(step, (q, self.overlap(q), waiting), count * len(bends))[0]
+
+    def own(self, finger: int | Int[Tensor, "1"]) -> Bool[Tensor, " n_tips"]:
+        """Which of the fingers is this one."""
+        return torch.arange(len(self.bends), device=self.bends.device) == finger
 
     def outer(self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"]) -> Bool[Tensor, "n n_tips n_dof"]:
         """Those of the joints that move no link of their finger that touches the object."""
@@ -147,8 +185,8 @@ class _Closer:
         return torch.where(moving, share[:, None], 0).sum(-1) / moving.sum(-1).clamp_min(1)
 
     def along(
-        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_dof"], share: Float[Tensor, "n #n_dof"]
-    ) -> Float[Tensor, "n n_dof"]:
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_dof"], share: Float[Tensor, "*s #n #n_dof"]
+    ) -> Float[Tensor, "*s n n_dof"]:
         """Moving joints this share of the way from `start` to closed."""
         return torch.where(moving, start + share * (self.energy.hand.closed_ends - start), start)
 
@@ -158,18 +196,32 @@ class _Closer:
         """The share of the way at which what moves of each finger meets the object, and whether it does; all close at once."""
         config, every = self.config, moving.any(1)
         shares = torch.linspace(0, 1, config.steps, device=start.device)
-        path = [self.along(start, every, share.expand(len(start), 1)) for share in shares]
         counted = self.moved(moving)
-        near = torch.stack([self.gaps(q, counted) <= config.contact for q in path])
+        near = torch.cat([
+            self.along_path(start, every, some, counted) <= config.contact for some in shares.split(self.samples)])
         first = near.float().argmax(0)
         meets = near.any(0) & (first > 0)  # a path that begins in the object meets nothing
         low, high = shares[(first - 1).clamp_min(0)], shares[first]
         owner = moving.float().argmax(1)  # the finger that each joint moves
-        for _ in range(config.halvings):
+
+        def step(
+            ends: tuple[Float[Tensor, "n n_tips"], Float[Tensor, "n n_tips"]], number: Int[Tensor, "1"]
+        ) -> tuple[Float[Tensor, "n n_tips"], Float[Tensor, "n n_tips"]]:
+            low, high = ends
             middle = (low + high) / 2
             inside = self.gaps(self.along(start, every, middle.gather(1, owner)), counted) <= config.contact
-            high, low = torch.where(inside, middle, high), torch.where(inside, low, middle)
-        return low, meets
+            return torch.where(inside, low, middle), torch.where(inside, middle, high)
+
+        return repeat(step, (low, high), config.halvings)[0], meets
+
+    def along_path(
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_dof"], shares: Float[Tensor, " s"],
+        counted: Bool[Tensor, "n n_tips p"],
+    ) -> Float[Tensor, "s n n_tips"]:
+        """Gaps of fingers at several shares of their way."""
+        path = self.along(start, moving, shares[:, None, None]).transpose(0, 1)  # n s n_dof
+        distance = self.energy.field.distances(body_points(self.energy, self.T, path))[0]
+        return torch.where(counted[:, None], distance[:, :, None], torch.inf).amin(-1).transpose(0, 1)
 
     def moved(self, moving: Bool[Tensor, "n n_tips n_dof"]) -> Bool[Tensor, "n n_tips p"]:
         """Those of each finger's surface points that its joints move."""
@@ -185,37 +237,41 @@ class _Closer:
         """Signed distance of the hand's surface points to the object [m]."""
         return self.energy.field.distances(body_points(self.energy, self.T, q))[0]
 
-    def keeps_apart(self, new: Float[Tensor, "n n_dof"], q: Float[Tensor, "n n_dof"]) -> Bool[Tensor, " n"]:
-        """Whether self-penetration grows no more than it may from `q` to `new`."""
-        return self.overlap(new) < self.overlap(q) + self.config.overlap
+    def moved_apart(
+        self, q: Float[Tensor, "n n_dof"], new: Float[Tensor, "n n_dof"], overlap: Float[Tensor, " n"],
+        wanted: Bool[Tensor, " n"],
+    ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
+        """New joints where they are wanted and self-penetration grows no more than it may, how much it is then, and where."""
+        after = self.overlap(new)
+        kept = wanted & (after < overlap + self.config.overlap)
+        return torch.where(kept[:, None], new, q), torch.where(kept, after, overlap), kept
 
     def overlap(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
         """Self-penetration [m]."""
         energy = self.energy
         centres = energy.ball.place(self.T[:, None] @ energy.hand.tree.forward(q))
-        return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
+        return energies.self_penetration(centres, energy.pairs).value.sum(-1)
 
 
-def body_points(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n p 3"]:
-    """The hand's surface points, for wrist poses and joints on the energy's device [m]."""
-    return energy.body.place(T[:, None] @ energy.hand.tree.forward(q))
+def body_points(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n *s n_dof"]
+) -> Float[Tensor, "n *s p 3"]:
+    """The hand's surface points, for wrist poses and joints, or several for each pose, on the energy's device [m]."""
+    poses = T.view(len(T), *[1] * (q.ndim - 1), 4, 4) @ energy.hand.tree.forward(q)
+    return energy.body.place(poses.flatten(0, -4)).unflatten(0, q.shape[:-1])
 
 
 def least_by_finger(energy: GraspEnergy, values: Float[Tensor, "n p"]) -> Float[Tensor, "n n_tips"]:
     """The least value of each finger's points, of one for each of `body_points`."""
     hand = energy.hand
     finger = hand.finger_of_link[energy.body.members.argmax(-1)]
-    return torch.stack([torch.where(finger == index, values, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
-
-
-def finger_joints(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
-    """The joints that move each finger, alone or with others."""
-    return torch.stack([hand.tree.moves[list(finger.links)].any(0) for finger in hand.fingers])
+    own = finger == torch.arange(len(hand.fingers), device=finger.device)[:, None]
+    return torch.where(own, values[:, None], torch.inf).amin(-1)
 
 
 def bending(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
     """The joints that bend each finger and no other."""
-    moves = finger_joints(hand)
+    moves = hand.finger_joints
     return moves & (moves.sum(0) == 1) & hand.movable & ~hand.abduction
 
 
@@ -234,7 +290,8 @@ class EasingConfig(Checked):
     unseen: float = 0.015
     """The same at most, where the surface is a guess: as far as it is from the nearest point that was seen [m]."""
     steps: int = 11  # samples of the way from the grasp to the pregrasp
-    batch_size: int = 64
+    batch_size: int | None = None
+    """Grasps opened at once; None takes what suits the device."""
 
 
 @torch.no_grad()
@@ -248,7 +305,8 @@ def ease_fingers(
     config, tree = config or EasingConfig(), None if seen is None else KDTree(seen)
     if not len(grasps):
         return grasps
-    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in grasps.in_parts(config.batch_size)]))
+    parts = grasps.in_parts(at_once(energy.device, ON_CPU, EACH, config.batch_size))
+    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in parts]))
 
 
 @torch.no_grad()
@@ -256,18 +314,18 @@ def missing_clearance(
     energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
 ) -> Float[Tensor, " n"]:
     """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none."""
-    config, device = config or EasingConfig(), energy.centre.device
+    config, device = config or EasingConfig(), energy.device
     lacking, tree = [torch.zeros(0)], None if seen is None else KDTree(seen)
-    for part in grasps.in_parts(config.batch_size):
+    for part in grasps.in_parts(at_once(device, ON_CPU, EACH, config.batch_size)):
         _, spare = _clearance(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
         lacking.append((-spare).amax(-1).clamp_min(0).cpu())
     return torch.cat(lacking)
 
 
 def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config: EasingConfig) -> Float[Tensor, "n n_dof"]:
-    device, hand = energy.centre.device, energy.hand
+    device, hand = energy.device, energy.hand
     T, q, opened = (x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints))
-    moved = finger_joints(hand)
+    moved = hand.finger_joints
     bends = moved.any(0) & hand.movable & ~hand.abduction
     stays = ~(hand.tree.moves & bends).any(-1)[energy.body.members.argmax(-1)]
     shares = torch.linspace(0, 1, config.steps, device=device)

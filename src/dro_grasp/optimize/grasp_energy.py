@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 
 from dro_grasp.devices import Rows, on_device
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.distance_field import Balls, DistanceField
+from dro_grasp.geometry.distance_field import Balls, DistanceField, DistanceFields
 from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -23,6 +25,7 @@ from dro_grasp.optimize.contacts import (
     ContactCandidates,
     ContactConfig,
     LinkPoints,
+    LinkSpheres,
     contact_candidates,
     link_spheres,
     tip_links,
@@ -216,8 +219,9 @@ class Evaluation(Rows):
     clearance: Float[Tensor, "n 1"]
     """Weighted penetration into the surroundings, and touch beside the contact region. It says nothing about the grasp itself,
     so it is not among the terms."""
-    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]
+    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its pivot [1/rad]
     by_joint: Float[Tensor, "n n_dof"]
+    pivot: Float[Tensor, "n 3"]  # the hand's grasp centre [m]
 
     @property
     def total(self) -> Float[Tensor, " n"]:
@@ -238,6 +242,28 @@ class Workspace:
         return Workspace(around, None if self.contact_region is None else on_device(self.contact_region, device))
 
 
+class _HandParts(NamedTuple):
+    """What an energy needs of a hand, whatever the object."""
+
+    hand: Hand
+    candidates: ContactCandidates
+    spheres: LinkSpheres
+    one_hot: Float[Tensor, "n_links n_links"]
+    contact_points: LinkPoints
+    ball: LinkPoints
+    pairs: energies.SpherePairs
+
+    @staticmethod
+    def of(hand: Hand, contacts: ContactConfig | None, device: torch.device) -> _HandParts:
+        """Of a hand on the CPU, on a device."""
+        candidates, spheres = on_device(contact_candidates(hand, contacts), device), on_device(link_spheres(hand), device)
+        own, n_links = hand.to(device), hand.tree.n_links
+        return _HandParts(
+            own, candidates, spheres, torch.eye(n_links, dtype=own.tree.origin.dtype, device=device),
+            LinkPoints.of(candidates.points, candidates.links, n_links), LinkPoints.of(spheres.centres, spheres.links, n_links),
+            energies.SpherePairs.of(spheres.radii, spheres.pairs))
+
+
 class GraspEnergy:
     """The energy of a hand on an object, prepared for many evaluations."""
 
@@ -250,16 +276,29 @@ class GraspEnergy:
         `centre` is the object's centre of mass, `length` a typical distance of its surface from there [m]. The device is that
         of the evaluations; all that is given is on the CPU.
         """
-        self.length, workspace = length, workspace or Workspace()
-        self.workspace = workspace.to(device)
-        self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
-        self.spheres = on_device(link_spheres(hand), device)
-        self.source, hand = hand, hand.to(device)
-        self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
-        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
-        self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
-        self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
+        self._place(field, centre, length, workspace or Workspace(), device)
+        parts = hand.kept(("energy", contacts, self.device), lambda: _HandParts.of(hand, contacts, self.device))
+        self.source, self.hand, self.candidates, self.spheres = hand, parts.hand, parts.candidates, parts.spheres
+        self.one_hot, self.contact_points, self.ball, self.pairs = parts.one_hot, parts.contact_points, parts.ball, parts.pairs
         self._weigh(config or EnergyConfig())
+
+    def on(self, obj: ObjectModel, workspace: Workspace) -> GraspEnergy:
+        """The energy of the same hand, with the same weights, on another object."""
+        other, (centre, length) = copy(self), _size(obj)
+        other._place(obj.distance_field, centre, length, workspace, self.device)
+        other._weigh(self.config)
+        return other
+
+    def _place(
+        self, field: DistanceField, centre: Float[Tensor, "3"], length: float, workspace: Workspace, device: torch.device | str
+    ) -> None:
+        """Keep what is known of the object and of its surroundings."""
+        self.field: DistanceField | DistanceFields = on_device(field, device)
+        self.centre, self.length, self.workspace = centre.to(device), length, workspace.to(device)
+        self.centres: Float[Tensor, "#n 1 3"] = self.centre[None, None]
+        """The centre of mass of each row's object [m]; one for all rows, unless the energy is of several objects."""
+        self.lengths: float | Float[Tensor, "n 1"] = length
+        """The same of `length`."""
 
     @staticmethod
     def of_object(
@@ -267,10 +306,7 @@ class GraspEnergy:
         device: torch.device | str = "cpu", workspace: Workspace | None = None,
     ) -> GraspEnergy:
         """The energy on the object's grid of signed distances."""
-        surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
-        centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
-        length = float((surface - centre).norm(dim=-1).mean())
-        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, workspace)
+        return GraspEnergy(hand, obj.distance_field, *_size(obj), config, contacts, device, workspace)
 
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
         """This energy under other weights; it shares contacts, link spheres and distance field."""
@@ -278,24 +314,80 @@ class GraspEnergy:
         other._weigh(config)
         return other
 
+    @staticmethod
+    def joined(energies: Sequence[GraspEnergy], counts: Sequence[int]) -> GraspEnergy:
+        """The energy of rows of several objects, so many of each, with one hand and the same weights for all.
+
+        Its rows are those of the tensors that it is called with; `rows` tells which they are where a batch is split.
+
+        Raises:
+            ValueError: An object has surroundings or a contact region, or hands, weights or devices differ.
+        """
+        first = energies[0]
+        if len({id(energy) for energy in energies}) == 1:
+            return first
+        if not all(energy.joins(first) for energy in energies):
+            raise ValueError("energies of several hands, weights or workspaces cannot be joined")
+        device, other = first.device, copy(first)
+        number = torch.tensor(counts)
+        lengths = torch.tensor([energy.length for energy in energies]).repeat_interleave(number)
+        centres = torch.stack([energy.centre.cpu() for energy in energies]).repeat_interleave(number, 0)
+        other.field = DistanceFields.of([energy.field for energy in energies], counts)  # type: ignore[misc]
+        other.centres, other.lengths = centres.to(device)[:, None], lengths.to(device)[:, None]
+        return other
+
+    def joins(self, other: GraspEnergy) -> bool:
+        """Whether rows of both can be computed as one."""
+        free = all(e.workspace.surroundings is None and e.region_term is None for e in (self, other))
+        same = (self.source is other.source, self.config == other.config, self.device == other.device)
+        return free and all(same) and isinstance(self.field, DistanceField)
+
+    @cached_property
+    def barred(self) -> Float[Tensor, "n_slots k"]:
+        """Zero where a slot may take a candidate, infinity elsewhere."""
+        return torch.where(self.candidates.slot_weights > 0, 0.0, torch.inf)
+
+    def rows(self, index: slice | Int[Tensor, " k"]) -> GraspEnergy:
+        """The energy of some of the rows."""
+        if isinstance(self.field, DistanceField):
+            return self
+        assert isinstance(self.lengths, Tensor)
+        other = copy(self)
+        other.field, other.centres, other.lengths = self.field.rows(index), self.centres[index], self.lengths[index]
+        return other
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is evaluated."""
+        return self.centre.device
+
     def touching(self, candidates: ContactCandidates) -> GraspEnergy:
         """This energy with other contact candidates."""
         other = copy(self)
+        vars(other).pop("barred", None)
         other.candidates = candidates
         other.contact_points = LinkPoints.of(candidates.points, candidates.links, self.hand.tree.n_links)
         return other
 
+    def _spread_points(self, count: int) -> LinkPoints:
+        """So many of the hand's surface points, spread evenly, on the device."""
+        def make() -> LinkPoints:
+            thin = self.source.with_points(min(count, self.source.n_points)).to(self.device)
+            return LinkPoints.of(thin.link_points, thin.link_index, thin.tree.n_links)
+
+        return self.source.kept(("spread", count, self.device), make)
+
     def _weigh(self, config: EnergyConfig) -> None:
         hand = self.hand
-        thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
-        self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        self.config, self.body = config, self._spread_points(config.hand_points)
+        self.solid = self.source.kept(
+            ("solid", config.hand_points, self.device), lambda: self.body.beside(self.ball))
         margin = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
         self.clearance = None
         if self.workspace.surroundings is not None:
-            few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
-            body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
             self.clearance = Clearance(
-                hand, self.workspace.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+                hand, self.workspace.surroundings, self._spread_points(config.clearance_points), self.ball, self.spheres.radii,
+                config.clear, config.clearance)
         place = self.workspace.contact_region
         self.region_term = None if place is None else ContactRegionTerm(place, config.clear)
         self.lower = torch.where(hand.opening_signs > 0, hand.lower + margin, hand.lower)
@@ -305,13 +397,25 @@ class GraspEnergy:
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
     ) -> Evaluation:
         """Energy and gradient of n grasps; their contacts are candidates by index, those nearest to the surface by default."""
-        if contacts is None:
-            contacts = self.nearest_contacts(T_object_wrist, q)
+        poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
+        return self._at(T_object_wrist, q, poses, self._nearest(poses, math.inf) if contacts is None else contacts)
+
+    def of_nearest(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float
+    ) -> Evaluation:
+        """The same with the contacts of `nearest_contacts`."""
+        poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
+        return self._at(T_object_wrist, q, poses, self._nearest(poses, reach))
+
+    def _at(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], poses: Float[Tensor, "n n_links 4 4"],
+        contacts: Int[Tensor, "n c"],
+    ) -> Evaluation:
+        """Energy and gradient of hands whose links are at these poses [m]."""
         tree, config = self.hand.tree, self.config
-        poses = T_object_wrist[:, None] @ tree.forward(q)
         contact_terms, pulled, wrenches = self._contacts(poses, contacts)
-        body = self.body.place(poses)
-        distance, gradient = self.field.distances(body)
+        # Surface points and spheres are placed, and their distances looked up, as one.
+        (body, spheres), (distance, sphere_distance), (gradient, sphere_gradient) = self._distances(poses)
         inside = energies.penetration(distance - config.margin, gradient)
         beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
         if self.region_term is not None:
@@ -319,16 +423,15 @@ class GraspEnergy:
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
             beside = beside + pulled
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
-        spheres = self.ball.place(poses)
-        own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
+        own = energies.self_penetration(spheres, self.pairs)
         depth, by_sphere = inside.value.sum(-1), config.self_penetration * own.by_point
         if config.filled:
-            distance, gradient = self.field.distances(spheres)
-            pierced = energies.penetration(distance - self.spheres.radii, gradient)
+            pierced = energies.penetration(sphere_distance - self.spheres.radii, sphere_gradient)
             depth, by_sphere = depth + pierced.value.sum(-1), by_sphere + config.penetration * pierced.by_point
         wrenches = wrenches + energies.link_wrenches(spheres, by_sphere, self.ball.members)
         beyond, slope = energies.joint_margin(q, self.lower, self.upper)
-        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
+        pivot = self.pivot(T_object_wrist)
+        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, pivot)
         closure, apart, alignment = contact_terms
         terms = torch.stack([
             config.force_closure * closure,
@@ -340,9 +443,15 @@ class GraspEnergy:
         ], -1)
         by_joint = by_joint + config.joints * slope
         if self.clearance is not None:
-            near = self.clearance(T_object_wrist, q, poses, self.pivot(T_object_wrist))
+            near = self.clearance(T_object_wrist, q, poses, pivot)
             beside, by_pose, by_joint = beside + near.value, by_pose + near.by_pose, by_joint + near.by_joint
-        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype))
+        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype), pivot)
+
+    def _distances(self, poses: Float[Tensor, "n n_links 4 4"]) -> tuple[tuple[Float[Tensor, "..."], ...], ...]:
+        """Surface points and centres of spheres [m], their signed distances [m], and the gradients of these."""
+        placed, sizes = self.solid.place(poses), [len(self.body.members), len(self.ball.members)]
+        distance, gradient = self.field.distances(placed)
+        return placed.split(sizes, 1), distance.split(sizes, 1), gradient.split(sizes, 1)
 
     def nearest_contacts(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
@@ -351,21 +460,24 @@ class GraspEnergy:
 
         A slot without a candidate within `reach` [m] takes one from the slot that is nearest to the surface.
         """
-        candidates = self.candidates
-        poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
+        return self._nearest(T_object_wrist[:, None] @ self.hand.tree.forward(q), reach)
+
+    def _nearest(self, poses: Float[Tensor, "n n_links 4 4"], reach: float) -> Int[Tensor, "n c"]:
+        """The same of hands whose links are at these poses [m]."""
         points = self.contact_points.place(poses)
         distance = self.field.distances(points)[0].abs()
         if self.region_term is not None:
             distance = distance + self.region_term.pull(points).value
-        taken = torch.zeros_like(distance)
-        allowed = candidates.slot_weights > 0
-        nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
-        chosen = []
-        for slot in range(len(allowed)):
-            own = allowed[slot].expand(len(T_object_wrist), -1)
-            own = torch.where(nearest[:, slot, None] > reach, allowed[nearest.argmin(-1)], own)
-            index = (distance + taken + torch.where(own, 0.0, torch.inf)).argmin(-1, keepdim=True)
-            taken = taken.scatter(-1, index, 1.0)
+        barred = self.barred
+        nearest = (distance[:, None] + barred).amin(-1)
+        # A slot without a candidate takes one from the slot that is nearest.
+        slot = torch.arange(len(barred), device=nearest.device)
+        source = torch.where(nearest > reach, nearest.argmin(-1, keepdim=True), slot)
+        apart, chosen = barred[source], []
+        for k in range(len(barred)):
+            index = (distance + apart[:, k]).argmin(-1, keepdim=True)
+            # What is taken is one metre farther for the others.
+            distance = distance.scatter_add(-1, index, torch.ones_like(nearest[:, :1]))
             chosen.append(index)
         return torch.cat(chosen, -1)
 
@@ -384,7 +496,7 @@ class GraspEnergy:
         outward = se3.rotate(chosen[..., :3, :3], candidates.normals[contacts])
         surface = self.field.normals(points)
         normal, bend = surface.normal, surface.bend
-        closure = energies.force_closure(points - self.centre, normal, self.length)
+        closure = energies.force_closure(points - self.centres, normal, self.lengths)
         apart = energies.contact_distance(surface.distance, surface.gradient)
         align = energies.normal_alignment(outward, normal)
         # The object's normal turns with the contact's position, so its derivative joins that by position through `bend`.
@@ -405,6 +517,13 @@ class GraspEnergy:
         return (closure.value.sum(-1), apart.value.sum(-1), align.sum(-1)), pulled, wrenches
 
 
+def _size(obj: ObjectModel) -> tuple[Float[Tensor, "3"], float]:
+    """Centre of mass of an object [m], and a typical distance of its surface from there [m]."""
+    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+    centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
+    return centre, float((surface - centre).norm(dim=-1).mean())
+
+
 @dataclass(frozen=True)
 class NearestPoints:
     """For n grasps, the point nearest to the object on each of the l links that have surface points."""
@@ -422,10 +541,9 @@ class NearestPoints:
         hand = energy.hand
         points, normals = hand.points_and_normals(q, T_object_wrist)
         distance, gradient = energy.field.distances(points)
-        links = hand.link_index.unique()
+        links = hand.point_links
         # Points of other links are infinitely far away.
-        index = torch.stack([
-            torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in links.tolist()], 1)
+        index = torch.where(hand.link_index == links[:, None], distance[:, None], torch.inf).argmin(-1)
         outward = torch.nn.functional.normalize(_at(gradient, index), dim=-1)
         return NearestPoints(links, index, _at(points, index), _at(normals, index), distance.gather(1, index), outward)
 

@@ -345,7 +345,7 @@ class PinchSearch:
         cost = cost + config.table * (-above.amin(-1)).clamp_min(0) / config.misfit
         cost = cost + (-energy.field.distances(body)[0].amin(-1)).clamp_min(0) / config.misfit
         spheres = energy.ball.place(poses)
-        own = energies.self_penetration(spheres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
+        own = energies.self_penetration(spheres, energy.pairs).value.sum(-1)
         cost = cost + own / config.misfit
         if self.wanted is not None:
             cosine = (hand.palm_directions(T) @ self.wanted).clamp(-1, 1)
@@ -375,9 +375,9 @@ class PinchEnergy:
         self.goal = torch.stack([pairs.middle - half, pairs.middle + half], 1)
         self.pivot = energy.pivot
 
-    def nearest_contacts(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float) -> Int[Tensor, "n 2"]:
-        """The pads, wherever they are."""
-        return self.pads
+    def of_nearest(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float) -> Evaluation:
+        """With the pads, wherever they are."""
+        return self(T, q, self.pads)
 
     def __call__(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], pads: Int[Tensor, "n 2"]) -> Evaluation:
         """The energy and its gradient."""
@@ -397,7 +397,7 @@ class PinchEnergy:
         by_pose, by_joint = energies.joint_gradient(self.hand.tree, poses, wrenches, self.pivot(T))
         terms = base.terms.index_add(1, torch.tensor([1, 4]), torch.stack([apart, facing], 1))
         return Evaluation(terms, base.clearance, base.by_pose + by_pose,
-                          base.by_joint + by_joint * self.hand.movable.to(q.dtype))
+                          base.by_joint + by_joint * self.hand.movable.to(q.dtype), base.pivot)
 
 
 GRAVITY = 9.81  # [m/s^2]
@@ -433,7 +433,7 @@ def pads_of(energy: GraspEnergy, inner: float) -> ContactCandidates:
     weight = torch.where(facing[kept], 1.0, (known[kept] * given.slot_weights.sum(0)).sum(1))
     found = ContactCandidates(
         hand.link_points[kept], hand.link_normals[kept], hand.link_index[kept], finger[kept], weight[None], (PALM,), hand.thumb)
-    return on_device(found, energy.centre.device)
+    return on_device(found, energy.device)
 
 
 def partners(energy: GraspEnergy) -> Float[Tensor, "k 2 n_candidates"]:

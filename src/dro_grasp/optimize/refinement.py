@@ -6,15 +6,15 @@ Differs from the paper, which takes grasps as its solver leaves them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import side_by_side
-from dro_grasp.geometry.se3 import roma, turned_about
+from dro_grasp.devices import Rows, at_once, repeat, side_by_side
+from dro_grasp.geometry.se3 import roma, rotated_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -54,8 +54,13 @@ class RefineConfig(Checked):
     """How idle fingers close before the descent."""
     grip: GripConfig = field(default_factory=GripConfig)
     """How the squeeze is made after it."""
-    batch_size: int = 32
-    """Grasps refined at once."""
+    batch_size: int | None = None
+    """Grasps refined at once; None takes what suits the device."""
+
+
+ON_CPU = 32  # Grasps refined at once on a CPU: more do not fit its cache (ours, timed)
+EACH = 400e3
+"""Memory of a grasp in a step [bytes]: some copies of what a few thousand points and pairs of spheres need (ours, counted)."""
 
 
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
@@ -67,12 +72,20 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     config = config or RefineConfig()
     if not len(grasps):
         return grasps
-    device = energy.centre.device
-    parts = (column.to(device).split(config.batch_size) for column in (grasps.T_object_wrist, grasps.joints))
-    with torch.no_grad():
-        ends = side_by_side(lambda T, q: descend_near(energy, T, q, config), *parts)
-    T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
-    return grasps.with_poses(T, q)
+    T, q = descended(energy, grasps.T_object_wrist.to(energy.device), grasps.joints.to(energy.device), config)
+    return grasps.with_poses(T.cpu(), q.cpu())
+
+
+@torch.no_grad()
+def descended(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: RefineConfig
+) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
+    """The same for wrist poses and joints on the energy's device, where they stay."""
+    size = at_once(energy.device, ON_CPU, EACH, config.batch_size)
+    rows = [slice(start, start + size) for start in range(0, len(q), size)]
+    ends = side_by_side(lambda T, q, part: descend_near(energy.rows(part), T, q, config), T.split(size), q.split(size), rows)
+    ended_T, ended_q = (torch.cat(part) for part in zip(*ends, strict=True))
+    return ended_T, ended_q
 
 
 @runtime_checkable
@@ -85,13 +98,22 @@ class Slope(Protocol):
         """The point about which each hand turns [m]."""
         ...
 
-    def nearest_contacts(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float, /) -> Int[Tensor, "n c"]:
-        """Its contacts."""
+    def of_nearest(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float, /) -> Evaluation:
+        """Value and gradient, with the contacts that are nearest to the surface."""
         ...
 
-    def __call__(self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"], /) -> Evaluation:
-        """Value and gradient."""
-        ...
+
+@dataclass(frozen=True)
+class _Near(Rows):
+    """n grasps on their way: the start turned by `turn` about the pivot and shifted by `move`."""
+
+    move: Float[Tensor, "n 3"]  # [m]
+    turn: Float[Tensor, "n 3"]  # [rad]
+    rotation: Float[Tensor, "n 3 3"]  # the same as a matrix
+    T: Float[Tensor, "n 4 4"]
+    q: Float[Tensor, "n n_dof"]
+    value: Evaluation
+    pace: Float[Tensor, "n 1"]  # factor on the first steps
 
 
 def descend_near(
@@ -103,32 +125,29 @@ def descend_near(
     # No farther open than the hand opens; a grasp that is beyond already goes no farther.
     lower = torch.maximum(torch.minimum(hand.lower, q), q - config.largest_bend * unit)
     upper = torch.minimum(torch.maximum(hand.upper, q), q + config.largest_bend * unit)
-    # The pose is the start turned by `turn` about the pivot and shifted by `move`: both are bounded as they stand.
-    move, turn = torch.zeros_like(pivot), torch.zeros_like(pivot)
-    pace = torch.ones_like(pivot[:, :1])
-    contacts = energy.nearest_contacts(T, q, config.reach)
-    now = energy(T, q, contacts)
-    for _ in range(config.steps):
-        slope = -torch.cat([now.by_pose, now.by_joint * unit], -1)
+
+    def step(now: _Near, number: Int[Tensor, "1"]) -> _Near:
+        slope = -torch.cat([now.value.by_pose, now.value.by_joint * unit], -1)
         shift, spin, bend = (
             part / part.norm(dim=-1, keepdim=True).clamp_min(1e-9) for part in slope.split([3, 3, len(unit)], -1))
-        new_move = _within(move + pace * config.translation_step * shift, config.farthest)
-        new_turn = _within(
-            roma.rotmat_to_rotvec(roma.rotvec_to_rotmat(pace * config.rotation_step * spin) @ roma.rotvec_to_rotmat(turn)),
+        move = _within(now.move + now.pace * config.translation_step * shift, config.farthest)
+        turn = _within(
+            roma.rotmat_to_rotvec(roma.rotvec_to_rotmat(now.pace * config.rotation_step * spin) @ now.rotation),
             config.largest_turn)
+        rotation = roma.rotvec_to_rotmat(turn)
         # `bend` has unit length over all joints: scaled so that the root mean square step of a joint is joint_step.
-        new_q = q + pace * config.joint_step * len(unit) ** 0.5 * bend * unit
-        new_q = new_q.clamp(lower, upper)
-        new_T = turned_about(start, pivot, new_move, new_turn)
-        new_contacts = energy.nearest_contacts(new_T, new_q, config.reach)
-        new = energy(new_T, new_q, new_contacts)
-        lower_energy = new.total < now.total
-        chosen = lower_energy[:, None]
-        move, turn = torch.where(chosen, new_move, move), torch.where(chosen, new_turn, turn)
-        T, q = torch.where(chosen[..., None], new_T, T), torch.where(chosen, new_q, q)
-        now = new.where(lower_energy, now)
-        pace = pace * torch.where(chosen, config.growth, config.shrinkage)
-    return T, q
+        q = now.q + now.pace * config.joint_step * len(unit) ** 0.5 * bend * unit
+        q = q.clamp(lower, upper)
+        T = rotated_about(start, pivot, move, rotation)
+        new = _Near(move, turn, rotation, T, q, energy.of_nearest(T, q, config.reach), now.pace)
+        lowers = new.value.total < now.value.total
+        pace = now.pace * torch.where(lowers[:, None], config.growth, config.shrinkage)
+        return replace(new.where(lowers, now), pace=pace)
+
+    still = torch.zeros_like(pivot)
+    none, value = roma.rotvec_to_rotmat(still), energy.of_nearest(T, q, config.reach)
+    end = repeat(step, _Near(still, still, none, T, q, value, torch.ones_like(pivot[:, :1])), config.steps)
+    return end.T, end.q
 
 
 def _within(vector: Float[Tensor, "n 3"], length: float) -> Float[Tensor, "n 3"]:

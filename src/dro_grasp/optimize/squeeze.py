@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.devices import at_once
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.kinds import Checked
-from dro_grasp.optimize.fingers import finger_joints
 from dro_grasp.optimize.grasp_energy import GraspEnergy, NearestPoints
 
 
@@ -49,8 +49,12 @@ class GripConfig(Checked):
     """The same for fingers that do not touch, and for those that share their joints."""
     iterations: int = 200
     """Steps of the solver of forces."""
-    batch_size: int = 64
-    """Grasps solved at once."""
+    batch_size: int | None = None
+    """Grasps solved at once; None takes what suits the device."""
+
+
+ON_CPU = 64  # Grasps solved at once on a CPU (ours, timed)
+EACH = 1e6  # Memory of a grasp: the poses of all surface points, and the forces' matrices [bytes] (ours, counted)
 
 
 @torch.no_grad()
@@ -59,49 +63,63 @@ def gripping(energy: GraspEnergy, grasps: GraspBatch, config: GripConfig | None 
 
     Their fingers touch, as after refinement; a squeeze that they state is replaced.
     """
-    config = config or GripConfig()
-    made = [_targets(energy, part, config) for part in grasps.in_parts(config.batch_size)]
-    if not made:
+    if not len(grasps):
         return grasps
-    pregrasp, squeeze = (torch.cat(part) for part in zip(*made, strict=True))
+    T, q = grasps.T_object_wrist.to(energy.device), grasps.joints.to(energy.device)
+    pregrasp, squeeze = (part.cpu() for part in closing_targets(energy, T, q, config or GripConfig()))
     return grasps.replace(pregrasp_joints=pregrasp, squeeze_joints=squeeze)
 
 
-def _targets(
-    energy: GraspEnergy, grasps: GraspBatch, config: GripConfig
+@torch.no_grad()
+def closing_targets(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: GripConfig
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
-    """Pregrasp and squeeze, on the CPU."""
+    """Pregrasp and squeeze of wrist poses and joints on the energy's device, where they stay."""
+    size = at_once(energy.device, ON_CPU, EACH, config.batch_size)
+    made = [_targets(energy.rows(slice(start, start + size)), T[start : start + size], q[start : start + size], config)
+            for start in range(0, len(q), size)]
+    pregrasp, squeeze = (torch.cat(part) for part in zip(*made, strict=True))
+    return pregrasp, squeeze
+
+
+def _targets(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: GripConfig
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
+    """Pregrasp and squeeze."""
     hand, tree = energy.hand, energy.hand.tree
-    T, q = grasps.T_object_wrist.to(energy.centre), grasps.joints.to(energy.centre)
     near = NearestPoints.of(energy, T, q)
     touches = near.gap < config.reach
     outer, inner = pregrasp_and_squeeze(hand, T, q, _middle(energy, near, touches))
-    finger = torch.stack([torch.isin(near.links, torch.tensor(f.links, device=q.device)) for f in hand.fingers])
+    finger = hand.finger_links[:, near.links]
     involved = (touches[:, None] & finger).any(-1)
-    forces = contact_forces(near, touches, finger, energy.centre, energy.length, config)
+    forces = contact_forces(near, touches, finger, energy.centres, energy.lengths, config)
     jacobian = tree.point_jacobian(T[:, None] @ tree.forward(q), near.points, near.links)
     torque = torch.einsum("nlxd,nlx->nd", jacobian, forces)
-    moved = finger_joints(hand)
+    moved = hand.finger_joints
     # A joint that several fingers share goes on bringing those that do not touch yet.
     active = moved.any(0) & (involved[..., None] | ~moved).all(1)
     share = torch.where(active, config.touching, config.idle)
     target = q + share * (inner - q) + torque * hand.movable * tree.joint_unit**2 / config.stiffness
     lower, upper = torch.minimum(hand.lower, q), torch.maximum(hand.upper, q)
-    return outer.cpu(), target.clamp(lower, upper).cpu()
+    return outer, target.clamp(lower, upper)
 
 
 def _middle(energy: GraspEnergy, near: NearestPoints, touches: Bool[Tensor, "n l"]) -> Float[Tensor, "n 1 3"]:
     """What fingers close around [m]: the object; on a table, where they pinch a part of it, their contacts' middle."""
     around = energy.workspace.surroundings
     if around is None or not around.touch_plane:
-        return energy.centre.expand(len(touches), 1, 3)
+        return energy.centres.expand(len(touches), 1, 3)
     on = touches.to(near.points)[..., None]
     return torch.where(on.sum(1) > 0, (near.points * on).sum(1) / on.sum(1).clamp_min(1), energy.centre)[:, None]
 
 
+def _beside_points(length: float | Float[Tensor, "n 1"]) -> float | Float[Tensor, "n 1 1"]:
+    return length[..., None] if isinstance(length, Tensor) else length
+
+
 def contact_forces(
-    near: NearestPoints, touches: Bool[Tensor, "n l"], finger: Bool[Tensor, "f l"], centre: Float[Tensor, "3"], length: float,
-    config: GripConfig,
+    near: NearestPoints, touches: Bool[Tensor, "n l"], finger: Bool[Tensor, "f l"],
+    centre: Float[Tensor, "3"] | Float[Tensor, "#n 1 3"], length: float | Float[Tensor, "n 1"], config: GripConfig,
 ) -> Float[Tensor, "n l 3"]:
     """Forces of the links on the object [N]: inside their friction cones, balanced as well as possible.
 
@@ -111,7 +129,7 @@ def contact_forces(
     n, count = len(near.gap), min(config.contacts, near.gap.shape[1])
     kept = torch.where(touches, near.gap, torch.inf).topk(count, largest=False).indices
     rows = torch.arange(n, device=kept.device)[:, None]
-    inward, arm = -near.object_normals[rows, kept], (near.points[rows, kept] - centre) / length
+    inward, arm = -near.object_normals[rows, kept], (near.points[rows, kept] - centre) / _beside_points(length)
     on = touches[rows, kept].to(arm)
     edges = friction_cone(inward, config.friction, config.edges)
     wrench = torch.cat([edges, torch.linalg.cross(arm[..., None, :].expand_as(edges), edges)], -1) * on[..., None, None]

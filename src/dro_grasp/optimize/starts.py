@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
+from dro_grasp.devices import Rows
+from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField, DistanceFields
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, renamed
@@ -130,33 +131,61 @@ def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Gener
     return torch.where(hand.movable, q, hand.rest)
 
 
+@dataclass(frozen=True)
+class Drawn(Rows):
+    """What is random about n starts, on the CPU."""
+
+    joints: Float[Tensor, "n n_dof"]
+    aim: Float[Tensor, "n 3"]  # where palms aim [m]
+    rotation: Float[Tensor, "n 3 3"]
+    gap: Float[Tensor, " n"]  # distance between hand and object at which the approach ends [m]
+    back: Float[Tensor, " n"]  # how far back it begins [m]
+
+
 def starts(
     hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, "3"], n: int, config: StartConfig,
     generator: torch.Generator, surroundings: Surroundings | None = None,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
-    """Wrist poses and joints to start from.
+    """Wrist poses and joints to start from, on the CPU.
 
     Each palm aims at a point between the object's centre and a random surface point [m], from a random side with a random roll,
     and approaches until the hand is within the gap or the point is enclosed. In surroundings, more palms are turned than are
     needed, those with most room start, and those that would start under a plane are lifted.
     """
+    drawn = draw_starts(hand, surface, centre, n, config, generator, surroundings)
+    return approach(hand, field, drawn, config, surroundings)
+
+
+def draw_starts(
+    hand: Hand, surface: Float[Tensor, "k 3"], centre: Float[Tensor, "3"], n: int, config: StartConfig,
+    generator: torch.Generator, surroundings: Surroundings | None = None,
+) -> Drawn:
+    """All that is drawn; arguments as of `starts`."""
     q = start_joints(hand, n, config, generator)
-    points = hand.points(q)
     wanted, middle = surface, centre
     if (place := Balls.of(config.contact_region)) is not None:
         wanted = surface[place.distances(surface)[0] <= 0]
         middle = wanted.mean(0)
     pick = torch.randint(len(wanted), (n,), generator=generator)
     aim = middle + config.aim * torch.rand(n, 1, generator=generator) * (wanted[pick] - middle)
-    rotation = clearest_rotations(hand, points, aim, config, generator, surroundings)
-    direction = rotation @ hand.palm_direction_wrist
-    offset = aim - rotation @ hand.grasp_centre_wrist
-    reach = float((surface - centre).norm(dim=-1).max())
-    size = float((points - hand.grasp_centre_wrist).norm(dim=-1).max())
+    rotation = clearest_rotations(hand, q, aim, config, generator, surroundings)
     low, high = config.gap
     gap = low + (high - low) * torch.rand(n, generator=generator)
+    reach = float((surface - centre).norm(dim=-1).max())
+    size = float((hand.points(q) - hand.grasp_centre_wrist).norm(dim=-1).max())
+    return Drawn(q, aim, rotation, gap, torch.full_like(gap, 2 * reach + config.clearance * size))
+
+
+def approach(
+    hand: Hand, field: DistanceField | DistanceFields, drawn: Drawn, config: StartConfig,
+    surroundings: Surroundings | None = None,
+) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
+    """Where hands start that were drawn; everything is on one device."""
+    q, aim, rotation, gap, back = drawn.joints, drawn.aim, drawn.rotation, drawn.gap, drawn.back
+    points = hand.points(q)
+    direction = rotation @ hand.palm_direction_wrist
+    offset = aim - rotation @ hand.grasp_centre_wrist
     body = rotate(rotation[:, None], points) + offset[:, None]
-    back = torch.full((n,), 2 * reach + config.clearance * size, dtype=q.dtype)
     for _ in range(config.approach_steps):
         distance = field.distances(body - (back[:, None] * direction)[:, None])[0].amin(-1)
         back = (back - (distance - gap).clamp_min(0)).clamp_min(0)
@@ -167,7 +196,7 @@ def starts(
 
 
 def clearest_rotations(
-    hand: Hand, points: Float[Tensor, "n p 3"], aim: Float[Tensor, "n 3"], config: StartConfig, generator: torch.Generator,
+    hand: Hand, q: Float[Tensor, "n n_dof"], aim: Float[Tensor, "n 3"], config: StartConfig, generator: torch.Generator,
     surroundings: Surroundings | None,
 ) -> Float[Tensor, "n 3 3"]:
     """Wrist rotations of hands that aim at points; of several for each, the one that has most room in the surroundings."""
@@ -178,5 +207,5 @@ def clearest_rotations(
     rotations = wrist_rotations(hand, n * CHOICES, config.direction, spread, generator, up)
     rotations = rotations.unflatten(0, (n, CHOICES))
     placed = compose(rotations, aim[:, None] - rotations @ hand.grasp_centre_wrist)
-    lack = approach_cost(hand, placed, points[:, None], None if config.max_tilt else config.direction, surroundings)
+    lack = approach_cost(hand, placed, hand.points(q)[:, None], None if config.max_tilt else config.direction, surroundings)
     return rotations[torch.arange(n), lack.argmin(1)]

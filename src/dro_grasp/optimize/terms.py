@@ -34,7 +34,9 @@ class ContactTerm(NamedTuple):
     by_normal: Float[Tensor, "*b c 3"]  # derivative of the summed values by the normals given
 
 
-def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:
+def force_closure(
+    points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float | Float[Tensor, "*b 1"]
+) -> ContactTerm:
     """Squared six components of the net wrench of unit forces along the contact normals.
 
     Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure. Points are from
@@ -44,7 +46,7 @@ def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 
     force = normals.sum(-2)
     torque = torch.linalg.cross(points, normals, dim=-1).sum(-2) / length
     wrench = torch.cat([force, torque], -1)
-    arm = 2 * torque[..., None, :] / length
+    arm = (2 * torque / length)[..., None, :]
     by_point = torch.linalg.cross(normals, arm.expand_as(normals), dim=-1)
     by_normal = 2 * force[..., None, :] + torch.linalg.cross(arm.expand_as(points), points, dim=-1)
     return ContactTerm(wrench**2, by_point, by_normal)
@@ -70,15 +72,28 @@ def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3
     return PointTerm(-distance * inside, -gradient * inside[..., None])
 
 
-def self_penetration(centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]) -> PointTerm:
+class SpherePairs(NamedTuple):
+    """Pairs of spheres that must not overlap, as matrices."""
+
+    difference: Float[Tensor, "k s"]
+    """Difference of the one-hot rows of both: one matrix product with it is several times faster than gathering and adding."""
+    reach: Float[Tensor, " k"]
+    """Sum of the radii [m]."""
+
+    @staticmethod
+    def of(radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]) -> SpherePairs:
+        """From radii [m] and indices of spheres."""
+        first, second = pairs[:, 0], pairs[:, 1]
+        one_hot = torch.eye(len(radii), dtype=radii.dtype, device=radii.device)
+        return SpherePairs(one_hot[first] - one_hot[second], radii[first] + radii[second])
+
+
+def self_penetration(centres: Float[Tensor, "*b s 3"], pairs: SpherePairs) -> PointTerm:
     """Overlap of each pair of spheres, on links that must not touch [m]."""
-    first, second = pairs[:, 0], pairs[:, 1]
-    one_hot = torch.eye(len(radii), dtype=centres.dtype, device=centres.device)
-    difference = one_hot[first] - one_hot[second]
-    # One matrix product with the differences of one-hot rows is several times faster than gathering and adding by index.
-    apart = (centres.mT.reshape(-1, len(radii)) @ difference.T).unflatten(0, (*centres.shape[:-2], 3))
+    difference, count = pairs.difference, centres.shape[-2]
+    apart = (centres.mT.reshape(-1, count) @ difference.T).unflatten(0, (*centres.shape[:-2], 3))
     distance = apart.square().sum(-2).clamp_min(1e-12).sqrt()
-    overlap = radii[first] + radii[second] - distance
+    overlap = pairs.reach - distance
     overlapping = (overlap > 0).to(centres.dtype)
     push = -apart * (overlapping / distance)[..., None, :]
     by_point = (push.flatten(0, -2) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT

@@ -118,3 +118,5 @@ class PredictorConfig(Checked):
     """What becomes of candidates."""
     rescue: RescueConfig = field(default_factory=RescueConfig)
     """When rivals are made."""
+    together: bool = False
+    """Compute the objects of one call together on a CPU too, as on other devices: a check, which gains nothing."""

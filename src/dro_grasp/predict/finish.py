@@ -6,9 +6,11 @@ Measurements say that this does most of the work, so predictor, benchmark and ar
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
@@ -22,9 +24,9 @@ from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violation
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
-from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best, weigh_settled
+from dro_grasp.predict.settling import SettleConfig, SettledBest, can_settle, settle_best_all, weigh_settled
 from dro_grasp.predict.sources.source import Candidates
-from dro_grasp.predict.stages import complete, ease, refine, scored
+from dro_grasp.predict.stages import complete, ease, refine_all, score_all
 from dro_grasp.simulation.weighing import WeighingConfig
 
 LEAST_CONFIDENCE = 0.2
@@ -128,6 +130,14 @@ class Finished:
         """The best as they were proposed."""
         return self.candidates[self.rows]
 
+    def beside(self, rivals: Finished) -> Finished:
+        """With finished candidates of earlier calls, which stay in the choice."""
+        seconds = {name: rivals.seconds[name] + spent for name, spent in self.seconds.items()}
+        return Finished(
+            self.problem, self.config, self.keep, GraspBatch.concatenate([rivals.pool, self.pool]),
+            Candidates.concatenate([rivals.candidates, self.candidates]), self.refined, rivals.made + self.made,
+            rivals.dropped + self.dropped, seconds, (*rivals.doubts, *self.doubts))
+
     def lacking(self, least_score: float) -> int:
         """How many of the wanted grasps are missing, or score no better than `least_score`."""
         return max(0, self.keep - int((self.pool.score > least_score).sum()))
@@ -149,29 +159,60 @@ def finish(
     Raises:
         GraspFileError: The candidates are of another hand.
     """
+    return finish_all([problem], [candidates], config, keep, [rivals])[0]
+
+
+def finish_all(
+    problems: Sequence[GraspProblem], candidates: Sequence[Candidates], config: FinishConfig | None = None, keep: int = 16,
+    rivals: Sequence[Finished | None] | None = None,
+) -> list[Finished]:
+    """The same for several objects, together where that is quicker; each takes an equal share of the time."""
     config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
     with watch("refine"):
-        if config.refine is None or candidates.exact:
-            whole = complete(problem, candidates.grasps)
-        else:
-            whole = refine(problem, candidates.grasps, config.refine)
-    allowed = feasible(problem, whole, config.admission)
-    dropped = Counter({TURNED: candidates.turned}) + count_violations(problem, whole[~allowed], config.admission)
-    candidates, made = candidates[allowed], len(candidates) + candidates.turned
+        whole = _refined(problems, candidates, config)
+    allowed = [feasible(problem, grasps, config.admission) for problem, grasps in zip(problems, whole, strict=True)]
+    dropped = [Counter({TURNED: own.turned}) + count_violations(problem, grasps[~kept], config.admission)
+               for problem, own, grasps, kept in zip(problems, candidates, whole, allowed, strict=True)]
     with watch("rank"):
-        refined = pool = scored(problem, whole[allowed], config.score)
-    doubts = ("",) * len(pool)
-    if config.settle is not None and len(refined):
-        if can_settle(problem):
-            with watch("settle"):
-                rows, pool, doubts = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
-            candidates = candidates[rows]
-        else:
-            pool = refined.replace(score=holding_score(refined.score, Evidence.none(len(refined), problem.mass)))
-    seconds = watch.seconds
-    if rivals is not None:
-        pool, doubts = GraspBatch.concatenate([rivals.pool, pool]), (*rivals.doubts, *doubts)
-        candidates = Candidates.concatenate([rivals.candidates, candidates])
-        dropped, made = rivals.dropped + dropped, rivals.made + made
-        seconds = {name: rivals.seconds[name] + spent for name, spent in seconds.items()}
-    return Finished(problem, config, keep, pool, candidates, refined, made, dropped, seconds, doubts)
+        refined = score_all(problems, [grasps[kept] for grasps, kept in zip(whole, allowed, strict=True)], config.score)
+    admitted = [own[kept] for own, kept in zip(candidates, allowed, strict=True)]
+    if config.settle is None:
+        settled = [SettledBest(torch.arange(len(grasps)), grasps, ("",) * len(grasps)) for grasps in refined]
+    else:
+        settled = _settled(problems, refined, keep, config, config.settle, watch)
+    seconds = {name: spent / len(problems) for name, spent in watch.seconds.items()}
+    made = [len(own) + own.turned for own in candidates]
+    done = [Finished(problem, config, keep, own.grasps, admitted[i][own.rows], refined[i], made[i], dropped[i], dict(seconds),
+                     own.doubts) for i, (problem, own) in enumerate(zip(problems, settled, strict=True))]
+    return done if rivals is None else [own if other is None else own.beside(other) for own, other in zip(
+        done, rivals, strict=True)]
+
+
+def _refined(
+    problems: Sequence[GraspProblem], candidates: Sequence[Candidates], config: FinishConfig
+) -> list[GraspBatch]:
+    """Complete grasps of all candidates, refined unless they are exact."""
+    rough = [] if config.refine is None else [i for i, own in enumerate(candidates) if not own.exact]
+    found = dict(zip(rough, refine_all(
+        [problems[i] for i in rough], [candidates[i].grasps for i in rough], config.refine), strict=True))
+    return [found[i] if i in found else complete(problem, own.grasps) for i, (problem, own) in enumerate(
+        zip(problems, candidates, strict=True))]
+
+
+def _settled(
+    problems: Sequence[GraspProblem], refined: Sequence[GraspBatch], keep: int, config: FinishConfig,
+    settling: SettleConfig, watch: Stopwatch,
+) -> list[SettledBest]:
+    """What is in the choice of each: the better share, settled; all, where the hand cannot settle."""
+    rows = [i for i, problem in enumerate(problems) if can_settle(problem) and len(refined[i])]
+    made: dict[int, SettledBest] = {}
+    if rows:
+        with watch("settle"):
+            some = settle_best_all(
+                [problems[i] for i in rows], [refined[i] for i in rows], keep, settling, config.score, config.admission)
+        made = dict(zip(rows, some, strict=True))
+    for i, (problem, grasps) in enumerate(zip(problems, refined, strict=True)):
+        if i not in made:
+            score = holding_score(grasps.score, Evidence.none(len(grasps), problem.mass))
+            made[i] = SettledBest(torch.arange(len(grasps)), grasps.replace(score=score), ("",) * len(grasps))
+    return [made[i] for i in range(len(problems))]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,15 +28,15 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.starts import Direction
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.finish import FinishConfig, Finished, finish
-from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.finish import FinishConfig, Finished, finish_all
+from dro_grasp.predict.problem import GraspProblem, problems_of
 from dro_grasp.predict.shortage import shortage_in_words
 from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.sources.registry import source_or_name
-from dro_grasp.predict.sources.source import Progress, Source, ask
+from dro_grasp.predict.sources.source import Asked, Candidates, Progress, Source, ask, ask_all
 from dro_grasp.predict.sources.variation import VariationSource
-from dro_grasp.predict.stages import complete
+from dro_grasp.predict.stages import complete, grouped
 
 PARTS = ("network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease")
 """Parts of a prediction whose seconds are always told."""
@@ -153,8 +154,30 @@ class GraspPredictor:
             warnings.warn(made.shortage, stacklevel=2)
         return made.grasps
 
-    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
-    @torch.no_grad()
+    def predict_many(
+        self, hand: Hand, objects: Sequence[ObjectModel], num: int = 16, seed: int = 0, constraints: Constraints | None = None,
+        *, candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
+        least_confidence: float | None = None,
+    ) -> list[GraspBatch]:
+        """Grasps of several objects: those of `predict`, computed together on a GPU, one object after the other on a CPU.
+
+        Arguments are those of `predict`. An object of which no grasp was found has an empty batch, with a warning.
+
+        Raises:
+            OptionError: An argument is out of range, or a table is above its object.
+        """
+        problems = problems_of(hand, objects, self.device, constraints or Constraints())
+        for problem in problems:
+            if (warning := problem.constraints.warning(problem.obj)) is not None:
+                warnings.warn(f"{problem.obj.name}: {warning}", stacklevel=2)
+        request = GraspRequest(num, seed, candidates, refine, temperature, source, least_confidence)
+        found = []
+        for problem, made in zip(problems, self.run_many(problems, request), strict=True):
+            if (shortage := str(made) if isinstance(made, NoGraspError) else made.shortage) is not None:
+                warnings.warn(shortage, stacklevel=2)
+            found.append(GraspBatch.none(hand, problem.obj) if isinstance(made, NoGraspError) else made.grasps)
+        return found
+
     def run(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Prediction:
         """Ask the sources, finish their candidates, and keep the best; results do not depend on batch sizes.
 
@@ -167,30 +190,42 @@ class GraspPredictor:
             NoGraspError: No grasp was found.
             OptionError: There is no such source, or it does not know the hand.
         """
-        first, rescue = self._roles(problem, request)
-        for source in (first, rescue):
-            if source is not None and not source.knows(problem.hand):
-                raise OptionError(f"source '{source.name}' does not know hand '{problem.hand.name}'; choose another source")
+        made, = self.run_many([problem], request, progress)
+        if isinstance(made, NoGraspError):
+            raise made
+        return made
+
+    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
+    @torch.no_grad()
+    def run_many(
+        self, problems: Sequence[GraspProblem], request: GraspRequest, progress: Progress | None = None
+    ) -> list[Prediction | NoGraspError]:
+        """The same for several problems with one hand, round by round: what is asked of one source is made together.
+
+        Args:
+            problems: With one hand, on the predictor's device.
+            request: What is asked for, of each.
+            progress: See `Progress`.
+
+        Returns:
+            For each problem what `run` returns, or the error of one without any grasp.
+
+        Raises:
+            OptionError: There is no such source, or it does not know the hand.
+        """
         config = self.config.finish
         if not request.refine:
             config = replace(config, refine=None, settle=None, ease=None, least_confidence=0.0)
         if request.least_confidence is not None:
             config = replace(config, least_confidence=request.least_confidence)
-        asked = _Asking(self, problem, request, config, progress)
-        if first is not None:
-            asked.until_enough(first)
-        if rescue is not None:
-            asked.until_trusted([source for source in (rescue, first) if source is not None])
-        done, shortage = asked.done, None
-        if done is None or len(done.rows) < request.num:
-            shortage = shortage_in_words(problem, request.num, done, alone=first is None or rescue is None)
-        if done is None or not len(done.rows):
-            raise NoGraspError(str(shortage))
-        proposed = done.proposed
-        given, before = (grasps.with_asked(request.num) for grasps in (
-            with_own_files(done.grasps, problem.hand, problem.obj), complete(problem, proposed.grasps)))
-        return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped),
-                          asked.seconds | done.watch.seconds, shortage)
+        under_way = [_Asking(self, problem, request, config) for problem in problems]
+        rounds = {asking: asking.rounds(*self._roles(asking.problem, request)) for asking in under_way}
+        while rounds:
+            now = {asking: ask for asking, turns in rounds.items() if (ask := next(turns, None)) is not None}
+            rounds = {asking: rounds[asking] for asking in now}
+            for together in _alike(now):
+                _take(together, [now[asking] for asking in together], progress)
+        return [asking.result() for asking in under_way]
 
     def source(self, name: str | Source, temperature: float | None = None) -> Source:
         """A source by its name, with the predictor's weights and configuration where it has any.
@@ -221,41 +256,71 @@ class GraspPredictor:
         return (None, named) if isinstance(named, OptimiserSource) else (named, None)
 
 
+class _Ask(NamedTuple):
+    """What is asked of a source next."""
+
+    source: Source
+    num: int
+    seed: int
+
+
 class _Asking:
     """One request under way: what was finished so far."""
 
     def __init__(
-        self, predictor: GraspPredictor, problem: GraspProblem, request: GraspRequest, config: FinishConfig,
-        progress: Progress | None,
+        self, predictor: GraspPredictor, problem: GraspProblem, request: GraspRequest, config: FinishConfig
     ) -> None:
         self.config, self.n_points = predictor.config, predictor.network.config.n_hand
-        self.problem, self.request, self.finishing, self.progress = problem, request, config, progress
+        self.problem, self.request, self.finishing = problem, request, config
         self.done: Finished | None = None
+        self.alone = False
         self.made = Counter[str]()  # candidates by source
         self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
 
-    def ask(self, source: Source, num: int, seed: int) -> Finished:
-        """Candidates of one source that it has not proposed before, finished beside those that it has."""
-        made = ask(source, self.problem, num, seed, self.progress, self.n_points)
-        self.made[source.name] += len(made)
-        if self.done is not None:
-            made = made.beside(self.done.candidates)
-        self.done = done = finish(self.problem, made, self.finishing, self.request.num, self.done)
-        self.seconds |= {name: self.seconds.get(name, 0.0) + spent for name, spent in made.seconds.items()} | done.seconds
-        return done
+    def rounds(self, first: Source | None, rescue: Source | None) -> Iterator[_Ask]:
+        """What is asked for, one after the other; before the next is asked for, `take` is called with what came."""
+        hand = self.problem.hand
+        for source in (first, rescue):
+            if source is not None and not source.knows(hand):
+                raise OptionError(f"source '{source.name}' does not know hand '{hand.name}'; choose another source")
+        self.alone = first is None or rescue is None
+        if first is not None:
+            yield from self.until_enough(first)
+        if rescue is not None:
+            yield from self.until_trusted([source for source in (rescue, first) if source is not None])
 
-    def until_enough(self, source: Source) -> None:
+    def take(self, done: Finished, made: Candidates) -> None:
+        """Keep what came of what was asked for."""
+        self.done = done
+        self.seconds |= {name: self.seconds.get(name, 0.0) + spent for name, spent in made.seconds.items()} | done.seconds
+
+    def result(self) -> Prediction | NoGraspError:
+        """What is returned."""
+        done, request, shortage = self.done, self.request, None
+        if done is None or len(done.rows) < request.num:
+            shortage = shortage_in_words(self.problem, request.num, done, self.alone)
+        if done is None or not len(done.rows):
+            return NoGraspError(str(shortage))
+        proposed = done.proposed
+        given, before = (grasps.with_asked(request.num) for grasps in (
+            with_own_files(done.grasps, self.problem.hand, self.problem.obj), complete(self.problem, proposed.grasps)))
+        return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped),
+                          self.seconds | done.watch.seconds, shortage)
+
+    def until_enough(self, source: Source) -> Iterator[_Ask]:
         """Candidates until as many as were asked for are admitted, as long as that is in sight."""
         wanted, retry = self.request.num * self.request.candidates, self.config.retry
         count, admitted = wanted, 0
         for seed in (self.request.seed, *_drawn(self.request.seed, retry.rounds - 1)):
-            done = self.ask(source, count, seed)
+            yield _Ask(source, count, seed)
+            done = self.done
+            assert done is not None
             admitted += len(done.refined)
             if admitted >= wanted or admitted <= retry.least_yield * done.made:
                 return
             count = min(wanted, math.ceil(retry.reserve * (wanted - admitted) * done.made / admitted))
 
-    def until_trusted(self, sources: Sequence[Source]) -> None:
+    def until_trusted(self, sources: Sequence[Source]) -> Iterator[_Ask]:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
         rescue, flat = self.config.rescue, self.problem.lies_flat
         levels, each = rescue.rounds(self.problem.surroundings is not None and not flat)
@@ -267,7 +332,7 @@ class _Asking:
             if k and nothing and self._is_hopeless():
                 return
             count = rescue.blind if k and nothing else each * lacking
-            self.ask(self._promising(sources, least_score), count, seed)
+            yield _Ask(self._promising(sources, least_score), count, seed)
 
     def _promising(self, sources: Sequence[Source], least_score: float) -> Source:
         """The source of whose candidates the largest share is trusted so far; the first of several."""
@@ -289,6 +354,31 @@ class _Asking:
             return not len(self.done.rows)
         rescue = self.config.rescue
         return self.done.made >= rescue.patience and not bool((self.done.pool.score > rescue.hopeless).any())
+
+
+def _alike(now: Mapping[_Asking, _Ask]) -> list[list[_Asking]]:
+    """Requests whose next candidates are made and finished together."""
+    asking, kinds = list(now), [now[each].source.name for each in now]
+    groups = [[i for i, own in enumerate(kinds) if own == kind] for kind in dict.fromkeys(kinds)]
+    return [[asking[rows[i]] for i in part] for rows in groups for part in grouped(
+        [asking[i].problem for i in rows], [1] * len(rows), len(rows) if asking[0].config.together else None)]
+
+
+def _take(asking: Sequence[_Asking], asks: Sequence[_Ask], progress: Progress | None) -> None:
+    """Candidates of one kind of source that it has not proposed before, finished beside those that it has."""
+    first, problems = asking[0], [each.problem for each in asking]
+    wanted = [Asked(problem, ask.num, ask.seed) for problem, ask in zip(problems, asks, strict=True)]
+    if isinstance(asks[0].source, VariationSource):  # each knows grasps of its own
+        made = [ask(source.source, *own, progress, first.n_points) for source, own in zip(asks, wanted, strict=True)]
+    else:
+        made = ask_all(asks[0].source, wanted, progress, first.n_points)
+    for i, each in enumerate(asking):
+        each.made[asks[i].source.name] += len(made[i])
+        if each.done is not None:
+            made[i] = made[i].beside(each.done.candidates)
+    finished = finish_all(problems, made, first.finishing, first.request.num, [each.done for each in asking])
+    for each, done, own in zip(asking, finished, made, strict=True):
+        each.take(done, own)
 
 
 def _drawn(first: int, count: int) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -107,7 +108,9 @@ class GraspProblem:
     @property
     def field(self) -> DistanceField:
         """Signed distances of the object, on the device."""
-        return self._default_energy.field
+        field = self._default_energy.field
+        assert isinstance(field, DistanceField)
+        return field
 
     @property
     def workspace(self) -> Workspace:
@@ -118,6 +121,11 @@ class GraspProblem:
     def surroundings(self) -> Surroundings | None:
         """What the hand stays clear of, on the device; None for nothing."""
         return self.workspace.surroundings
+
+    @property
+    def joins(self) -> bool:
+        """Whether it may be computed together with other objects: where hands may be, and touch, is not limited."""
+        return self._default_energy.joins(self._default_energy)
 
     @property
     def clearance(self) -> Clearance | None:
@@ -135,6 +143,14 @@ class GraspProblem:
         return GraspEnergy.of_object(
             self.hand, self.obj, device=self.device, workspace=self.constraints.workspace(self.obj, self.hand_reach))
 
+    def beside(self, obj: ObjectModel) -> GraspProblem:
+        """The problem of another object, with what is prepared of the hand shared."""
+        other = GraspProblem(self.hand, obj, self.device, self.constraints)
+        vars(other)["_thinned"] = self._thinned
+        around = self.constraints.workspace(obj, self.hand_reach)
+        vars(other)["_default_energy"] = self._default_energy.on(obj, around)
+        return other
+
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.
 
@@ -150,3 +166,13 @@ class GraspProblem:
         if self.contact_points is None:
             return self.obj.sample_points(count, generator).to(self.device)
         return self.contact_points[torch.randint(len(self.contact_points), (count,), generator=generator)].to(self.device)
+
+
+def problems_of(
+    hand: Hand, objects: Sequence[ObjectModel], device: torch.device | str, constraints: Constraints
+) -> list[GraspProblem]:
+    """Problems of several objects, for which the hand is prepared once; errors as of `GraspProblem`."""
+    if not objects:
+        return []
+    first = GraspProblem(hand, objects[0], device, constraints)
+    return [first, *(first.beside(obj) for obj in objects[1:])]

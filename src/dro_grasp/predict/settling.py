@@ -8,6 +8,7 @@ cloud. Ours.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ from dro_grasp.predict.lifting import LiftConfig, lifted
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, gives_way, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
-from dro_grasp.predict.stages import complete, grip, refine, scored
+from dro_grasp.predict.stages import complete, grip_all, refine_all, score_all
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import GraspState, Squeeze, WeightConfig, grasp_state, pressed
 from dro_grasp.simulation.trial import hand_shift, settle
@@ -136,19 +137,43 @@ def settle_best(
         score: How grasps are scored.
         admission: What the constraints let pass.
     """
+    return settle_best_all([problem], [grasps], least, config, score, admission)[0]
+
+
+def settle_best_all(
+    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], least: int, config: SettleConfig | None = None,
+    score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
+) -> list[SettledBest]:
+    """The same for several objects: each closes alone, the refinement and the score between are of all together."""
     config = config or SettleConfig()
+    chosen = [_better_share(*each, least, config) for each in zip(problems, batches, strict=True)]
+    some = [grasps[best] for grasps, best in zip(batches, chosen, strict=True)]
+    settled = settle_all(problems, some, config)
+    wrong = [~feasible(problem, own.grasps, admission) for problem, own in zip(problems, settled, strict=True)]
+    closed = [replaced(own.grasps, off, before[off]) for own, off, before in zip(settled, wrong, some, strict=True)]
+    known = score_all(problems, closed, score)
+    return [SettledBest(best, _judged_by(problem, grasps, own, off, config), doubts(own.known, off, own.jammed, config))
+            for problem, best, grasps, own, off in zip(problems, chosen, known, settled, wrong, strict=True)]
+
+
+def _better_share(problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig) -> Int[Tensor, " k"]:
+    """Rows of the grasps that are settled."""
     # The score, which is learned from objects that hang in the air, does not tell which of several pinches lifts.
     count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), min(len(grasps), least))
-    best = grasps.score.topk(count).indices.sort().values
-    closed, stable, known, jammed = settle_grasps(problem, grasps[best], config)
-    wrong = ~feasible(problem, closed, admission)
-    closed = replaced(closed, wrong, grasps[best[wrong]])
-    found = holding_score(scored(problem, closed, score).score, replace(known, stable=stable & ~wrong))
-    found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
+    return grasps.score.topk(count).indices.sort().values
+
+
+def _judged_by(
+    problem: GraspProblem, closed: GraspBatch, settled: Settled, wrong: Bool[Tensor, " n"], config: SettleConfig
+) -> GraspBatch:
+    """Scored grasps with the score that counts what closing showed."""
+    stable = settled.stable & ~wrong
+    found = holding_score(closed.score, replace(settled.known, stable=stable))
+    found = torch.where(stable, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
         lacking = missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
         found = config.guess_offset + config.guess_worth * found - config.clearance_worth * lacking
-    return SettledBest(best, closed.replace(score=found), doubts(known, wrong, jammed, config))
+    return closed.replace(score=found)
 
 
 def doubts(
@@ -179,17 +204,58 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     Raises:
         HandError: The hand came without its description.
     """
-    config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
-    grasps = problem.on_table(complete(problem, grasps.without("score")))
-    if problem.lies_flat:
-        return _lifted(problem, grasps, config)
-    closed = settle(hand, obj, grasps, config.closing)
-    moved = hand_shift(hand, grasps, closed)
-    still, near = moved < config.still, moved < config.lost
-    rows = near.nonzero()[:, 0]
-    better = problem.on_table(_bettered(problem, grasps, closed, still, near, config)[rows])
-    asked = weight_config(problem, config)
-    done = pressed(hand, obj, better, config.protocol, config=asked)
+    return settle_all([problem], [grasps], config)[0]
+
+
+def settle_all(
+    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: SettleConfig | None = None
+) -> list[Settled]:
+    """The same for several objects: each closes alone, the refinement between is of all together."""
+    config = config or SettleConfig()
+    whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
+        problems, batches, strict=True)]
+    first = [None if problem.lies_flat else settle(problem.hand, problem.solid, grasps, config.closing)
+             for problem, grasps in zip(problems, whole, strict=True)]
+    hanging = [i for i, closed in enumerate(first) if closed is not None]
+    closed = [_Closed.of(problems[i], whole[i], first[i], config) for i in hanging]
+    better = dict(zip(hanging, _bettered([problems[i] for i in hanging], closed, config), strict=True))
+    moved = {i: own.moved for i, own in zip(hanging, closed, strict=True)}
+    return [_closed_again(problem, grasps, moved[i], better[i], config) if i in better else _lifted(problem, grasps, config)
+            for i, (problem, grasps) in enumerate(zip(problems, whole, strict=True))]
+
+
+class _Closed(NamedTuple):
+    """Grasps after the first closing."""
+
+    grasps: GraspBatch  # where it left them
+    moved: Float[Tensor, " n"]  # how far it moved the object [m]
+    still: Bool[Tensor, " n"]
+    near: Bool[Tensor, " n"]
+
+    @staticmethod
+    def of(problem: GraspProblem, before: GraspBatch, after: GraspBatch | None, config: SettleConfig) -> _Closed:
+        """What the closing showed."""
+        assert after is not None
+        moved = hand_shift(problem.hand, before, after)
+        return _Closed(after, moved, moved < config.still, moved < config.lost)
+
+
+def _bettered(problems: Sequence[GraspProblem], closed: Sequence[_Closed], config: SettleConfig) -> list[GraspBatch]:
+    """Closed grasps that squeeze with balanced forces, or are refined where closing moved the object."""
+    again = [own.near & ~own.still for own in closed]
+    gripping = grip_all(problems, [own.grasps[own.still] for own in closed], config.refinement)
+    refined = refine_all(problems, [own.grasps[rows] for own, rows in zip(closed, again, strict=True)], config.refinement)
+    return [replaced(replaced(own.grasps, own.still, grip), rows, fine)
+            for own, rows, grip, fine in zip(closed, again, gripping, refined, strict=True)]
+
+
+def _closed_again(
+    problem: GraspProblem, grasps: GraspBatch, moved: Float[Tensor, " n"], better: GraspBatch, config: SettleConfig
+) -> Settled:
+    """What becomes of better grasps as they squeeze for the weight and close once more."""
+    hand, obj, asked = problem.hand, problem.solid, weight_config(problem, config)
+    rows = (moved < config.lost).nonzero()[:, 0]
+    done = pressed(hand, obj, problem.on_table(better[rows]), config.protocol, config=asked)
     better = problem.on_table(done.grasps)
     state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
     better = better.replace(payload=done.payloads(~gives_way(state), asked.payload))
@@ -243,16 +309,6 @@ def is_jammed(hand: Hand, mass: float, squeeze: Squeeze, shortest_lever: float) 
 def effort_share(hand: Hand, torque: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
     """Largest share of its effort with which a joint squeezes [Nm or N]."""
     return (torque * hand.movable).abs().div(find_efforts(hand).limit).amax(1)
-
-
-def _bettered(
-    problem: GraspProblem, grasps: GraspBatch, closed: GraspBatch, still: Bool[Tensor, " n"], near: Bool[Tensor, " n"],
-    config: SettleConfig,
-) -> GraspBatch:
-    """Closed grasps that squeeze with balanced forces, or are refined where closing moved the object."""
-    again = near & ~still
-    better = replaced(closed, still, grip(problem, closed[still], config.refinement))
-    return replaced(better, again, refine(problem, closed[again], config.refinement))
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:

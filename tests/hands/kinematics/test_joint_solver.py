@@ -9,6 +9,7 @@ import torch
 
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import roma
+from dro_grasp.hands.kinematics import joint_solver
 from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig, StepConfig, Targets, best_step, read_joints, solve_joints
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
 from tests.helpers.toy_hand import toy_tree
@@ -110,6 +111,23 @@ def test_result_does_not_depend_on_the_batch(noise):
         np.testing.assert_allclose(alone.joints, together.joints[i], atol=1e-5)  # [rad or m]
         np.testing.assert_allclose(alone.T_world_wrist, together.T_world_wrist[i], atol=1e-5)
         assert alone.iterations == together.iterations[i]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_grasps_that_stay_in_the_batch_end_where_those_that_leave_it_do(noise, monkeypatch):
+    """A device does not look which grasps are done: they all take the last step, and the finished ones stay."""
+    tree = plain_tree()
+    targets = problem(tree, 12, noise)[0]
+    start = (torch.eye(4).expand(12, 4, 4), middle(tree, 12))
+    fewer = solve_joints(tree, targets, *start)
+    with monkeypatch.context() as patch:
+        patch.setattr(joint_solver, "_iterate", joint_solver._iterate_all)
+        every = solve_joints(tree, targets, *start)
+    for name in ("T_world_wrist", "joints", "residual"):
+        torch.testing.assert_close(getattr(every, name), getattr(fewer, name), atol=1e-6, rtol=0)
+    assert torch.equal(every.converged, fewer.converged)
+    assert torch.equal(every.iterations, fewer.iterations)
+    assert len(set(every.iterations.tolist())) > 1
 
 
 def test_outliers_count_once_and_not_squared():

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import Rows
+from dro_grasp.devices import Rows, repeat, where_any
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply, compose, invert, roma, rotate
 from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
@@ -48,20 +48,22 @@ def read_joints(
     known = torch.zeros(len(tree.moving_names), dtype=torch.bool, device=q.device)
     known[[tree.link_joint[link] for _, _, chain in segments for link in chain]] = True
     longest = max(len(chain) for _, _, chain in segments)
+    places = []
+    for place in range(longest):
+        rows = [(top, bottom, chain[place]) for top, bottom, chain in segments if len(chain) > place]
+        places.append(torch.tensor(rows).T.to(q.device))
     for _ in range(1 if longest == 1 else ROUNDS):
-        for place in range(longest):
-            rows = [(top, bottom, chain[place]) for top, bottom, chain in segments if len(chain) > place]
-            top, bottom, moving = (torch.tensor(column, device=q.device) for column in zip(*rows, strict=True))
-            q = _update(tree, T_world_link, q, known, top, bottom, moving)
+        for place in places:
+            q = _update(tree, T_world_link, q, known, *place)
     return q
 
 
 def _segments(tree: KinematicTree, valid: Bool[Tensor, " n_links"]) -> list[tuple[int, int, list[int]]]:
     """Triples: a known link, the next known link below it, and the moving links between them, topmost first."""
-    found = []
-    for bottom in valid.nonzero()[:, 0].tolist():
+    found, known = [], valid.tolist()
+    for bottom in [link for link, is_known in enumerate(known) if is_known]:
         chain, link = [], bottom
-        while link >= 0 and (link == bottom or not bool(valid[link])):
+        while link >= 0 and (link == bottom or not known[link]):
             if tree.kind[link] != FIXED:
                 chain.append(link)
             link = tree.parent[link]
@@ -76,14 +78,14 @@ def _update(
 ) -> Float[Tensor, "*b n_dof"]:
     """Set one joint of each segment to its best value and keep the others."""
     poses = tree.forward(q)
-    parent = torch.tensor(tree.parent, device=q.device)[moving]
+    parent = tree.parents[moving]
     # T_top_bottom = before @ joint motion @ after: solve for the motion that gives the wanted relative pose.
     before = invert(poses[..., top, :, :]) @ poses[..., parent, :, :] @ tree.origin[moving]
     after = invert(poses[..., moving, :, :]) @ poses[..., bottom, :, :]
     wanted = invert(target[..., top, :, :]) @ target[..., bottom, :, :]
     motion = invert(before) @ wanted @ invert(after)
     x = q @ tree.coupling.T + tree.offset
-    joint = torch.tensor(tree.link_joint, device=q.device)[moving]
+    joint = tree.link_joints[moving]
     x[..., joint] = _joint_value(tree, motion, moving, x[..., joint])
     return _independent(tree, x, q, known)
 
@@ -106,7 +108,7 @@ def _joint_value(
     angle = torch.atan2((axis * turned).sum(-1), trace - along)
     # Angles are equal up to whole turns: take the one nearest to the present value.
     angle = angle + 2 * math.pi * torch.round((near - angle) / (2 * math.pi))
-    revolute = torch.tensor(tree.kind, device=axis.device)[moving] == REVOLUTE
+    revolute = tree.kinds[moving] == REVOLUTE
     return torch.where(revolute, angle, (axis * motion[..., :3, 3]).sum(-1))
 
 
@@ -208,8 +210,8 @@ def _minimum_in_box(quadratic: _Quadratic, passes: int) -> Float[Tensor, "b p"]:
     at_lower, at_upper = (lower >= 0) & (gradient > 0) | frozen, (upper <= 0) & (gradient < 0) & ~frozen
     step, at_lower, at_upper, changed = _pass(quadratic, at_lower, at_upper)
     for _ in range(passes - 1):
-        rows = changed.nonzero()[:, 0]
-        if len(rows) == 0:
+        rows = where_any(changed)
+        if isinstance(rows, Tensor) and not len(rows):
             break
         again = _pass(quadratic.rows(rows), at_lower[rows], at_upper[rows])
         step[rows], at_lower[rows], at_upper[rows], changed[rows] = again
@@ -240,7 +242,16 @@ def _solve_free(quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: 
     matrix.diagonal(dim1=-2, dim2=-1).add_(1 - free)
     right = -(quadratic.gradient + (quadratic.matrix @ value[..., None])[..., 0]) * free
     factor, _ = torch.linalg.cholesky_ex(matrix)
-    return torch.cholesky_solve(right[..., None], factor)[..., 0] * free + value
+    return _solve(factor, right[..., None])[..., 0] * free + value
+
+
+def _solve(factor: Float[Tensor, "b p p"], right: Float[Tensor, "b p 1"]) -> Float[Tensor, "b p 1"]:
+    """The solution for a lower Cholesky factor."""
+    if factor.device.type == "cpu":
+        return torch.cholesky_solve(right, factor)
+    # CUDA's `cholesky_solve` allocates memory, which a graph does not allow.
+    half = torch.linalg.solve_triangular(factor, right, upper=False)
+    return torch.linalg.solve_triangular(factor.mT, half, upper=True)
 
 
 @dataclass(frozen=True)
@@ -353,7 +364,12 @@ def solve_joints(
 
 
 def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> JointSolution:
-    """Iterate until every grasp is done; finished grasps leave the batch for the solution, which is in double precision."""
+    """Iterate until every grasp is done, in double precision."""
+    return (_iterate_fewer if state.q.device.type == "cpu" else _iterate_all)(problem, state, config)
+
+
+def _iterate_fewer(problem: _Problem, state: _State, config: JointSolverConfig) -> JointSolution:
+    """Finished grasps leave the batch, which saves work where one may look at them."""
     none = torch.zeros_like(state.stalled)
     result = JointSolution(state.T.clone(), state.q.clone(), torch.zeros_like(state.cost), none.bool(), none)
     rows = torch.arange(len(state.q), device=state.q.device)
@@ -371,6 +387,27 @@ def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> Joi
         if len(rows) == 0:
             break
     return result
+
+
+@dataclass(frozen=True)
+class _Running(Rows):
+    """Iterates, and which of them are final."""
+
+    state: _State
+    done: Bool[Tensor, " b"]
+    iterations: Int[Tensor, " b"]
+
+
+def _iterate_all(problem: _Problem, state: _State, config: JointSolverConfig) -> JointSolution:
+    """All grasps iterate to the end, those that are done without moving, so that nobody has to wait for a look at them."""
+    def step(now: _Running, number: Int[Tensor, "1"]) -> _Running:
+        new, change = _advance(problem, now.state, config)
+        done = (change < config.tolerance) | (new.stalled >= 2)
+        return _Running(now.state.where(now.done, new), now.done | done, now.iterations + ~now.done)
+
+    none = torch.zeros_like(state.stalled)
+    end = repeat(step, _Running(state, none.bool(), none), config.max_iterations)
+    return JointSolution(end.state.T, end.state.q, point_norms(end.state.residual).mean(-1), end.done, end.iterations)
 
 
 def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tuple[_State, Float[Tensor, " b"]]:
@@ -405,14 +442,10 @@ def _problem(
 ) -> _Problem:
     """The problem in double precision, with the batch axes of the targets flattened."""
     positions = targets.positions.reshape(-1, *targets.positions.shape[-2:]).double()
-    coupling = tree.link_coupling
-    pair_link, dof = coupling.nonzero(as_tuple=True)
-    drive = (tree.descends[targets.links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]).T.repeat(1, 3)
-    gather = torch.zeros(tree.n_dof, len(dof), dtype=coupling.dtype, device=coupling.device)
-    gather[dof, torch.arange(len(dof), device=dof.device)] = 1
-    same = gather.shape[0] == gather.shape[1] and bool((gather.diagonal() == 1).all())
+    pairs = tree.pairs
+    drive = (tree.descends[targets.links][:, pairs.link].to(pairs.rate.dtype) * pairs.rate).T.repeat(1, 3)
     return _Problem(
-        tree, targets.links, targets.local.double(), drive, pair_link, None if same else gather, positions, lower, upper
+        tree, targets.links, targets.local.double(), drive, pairs.link, pairs.gather, positions, lower, upper
     )
 
 

@@ -7,7 +7,7 @@ Mimic joints and stated couplings are resolved once, when the tree is built: all
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,14 @@ FIXED = 0  # Kind of a link that does not move against its parent (ours)
 REVOLUTE = 1  # Kind of a link that turns about its joint's axis (ours)
 PRISMATIC = 2  # Kind of a link that slides along its joint's axis (ours)
 SLIDING_UNIT = 0.03  # Travel of a prismatic joint that moves a hand about as much as 1 rad of a revolute one [m] (ours)
+
+
+class DrivenLinks(NamedTuple):
+    """Pairs of a moving link and an independent joint (dof) that drives it."""
+
+    link: Int[Tensor, " pairs"]
+    rate: Float[Tensor, " pairs"]  # change of the link's own joint per unit of the dof
+    gather: Float[Tensor, "n_dof pairs"] | None  # sums pairs into dofs; None if pair i is dof i
 
 
 @dataclass(frozen=True)
@@ -101,8 +109,23 @@ class KinematicTree:
         return torch.tensor([i for i, parent in enumerate(self.parent) if parent < 0], device=self.origin.device)
 
     @cached_tensor
+    def parents(self) -> Int[Tensor, " n_links"]:
+        """`parent` as a tensor."""
+        return torch.tensor(self.parent, device=self.origin.device)
+
+    @cached_tensor
+    def link_joints(self) -> Int[Tensor, " n_links"]:
+        """`link_joint` as a tensor."""
+        return torch.tensor(self.link_joint, device=self.origin.device)
+
+    @cached_tensor
+    def kinds(self) -> Int[Tensor, " n_links"]:
+        """`kind` as a tensor."""
+        return torch.tensor(self.kind, device=self.origin.device)
+
+    @cached_tensor
     def _revolute(self) -> Bool[Tensor, " n_links"]:
-        return torch.tensor(self.kind, device=self.origin.device) == REVOLUTE
+        return self.kinds == REVOLUTE
 
     @cached_tensor
     def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
@@ -110,7 +133,7 @@ class KinematicTree:
         # For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
         # motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
         turns = self._revolute[:, None]
-        slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
+        slides = self.kinds[:, None] == PRISMATIC
         k = _skew(self.axis * turns)
         basis = self.origin.new_zeros(4, self.n_links, 4, 4)
         basis[0] = torch.eye(4)
@@ -131,7 +154,7 @@ class KinematicTree:
     @cached_tensor
     def link_offset(self) -> Float[Tensor, " n_links"]:
         """Value of each link's own joint at q = 0."""
-        joint = torch.tensor(self.link_joint, device=self.offset.device)
+        joint = self.link_joints
         # Fixed links have joint -1, which indexes the appended zero.
         return torch.cat([self.offset, self.offset.new_zeros(1)])[joint]
 
@@ -150,16 +173,26 @@ class KinematicTree:
         """moves[i, d]: independent joint d moves link i."""
         return (self.descends.float() @ (self.link_coupling != 0).float()) > 0
 
+    @cached_tensor
+    def pairs(self) -> DrivenLinks:
+        """Each moving link with each independent joint that drives it."""
+        coupling = self.link_coupling
+        link, dof = coupling.nonzero(as_tuple=True)
+        gather = torch.zeros(self.n_dof, len(dof), dtype=coupling.dtype, device=coupling.device)
+        gather[dof, torch.arange(len(dof), device=dof.device)] = 1
+        same = gather.shape[0] == gather.shape[1] and bool((gather.diagonal() == 1).all())
+        return DrivenLinks(link, coupling[link, dof], None if same else gather)
+
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Pose of every link in the root link's frame, T_root_link, at values of the independent joints [rad or m]."""
         x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
         basis = self._local_basis
         local = basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]
         # One batched product per depth of the tree, not one per link.
-        levels = [local[..., self._roots, :, :]]
+        levels = [local.index_select(-3, self._roots)]
         for links, parents in self._levels:
-            levels.append(levels[-1][..., parents, :, :] @ local[..., links, :, :])
-        return torch.cat(levels, -3)[..., self._level_order, :, :]
+            levels.append(levels[-1].index_select(-3, parents) @ local.index_select(-3, links))
+        return torch.cat(levels, -3).index_select(-3, self._level_order)
 
     def motion_axes(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"]

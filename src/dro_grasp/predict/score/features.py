@@ -107,18 +107,23 @@ def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor,
     return GraspFeatures(table(LINK_FEATURES, *state.gap.shape), state.nearness, table(GRASP_FEATURES, len(state.gap)))
 
 
+def _of_rows(value: float | Float[Tensor, "n 1"], like: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """A value that all rows share, or each has, as one for each."""
+    return value[:, 0] if isinstance(value, Tensor) else torch.full_like(like, value)
+
+
 def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> LinkMeasures:
     """Grasps as their features see them; arguments as for `grasp_features`."""
-    hand, device = energy.hand, energy.centre.device
-    grasps = complete(energy.source, grasps, energy.centre.cpu())
+    hand, device = energy.hand, energy.device
+    grasps = complete(energy.source, grasps, energy.centres.cpu())
     T, q, pregrasp, squeeze = (
         x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints))
     near = NearestPoints.of(energy, T, q)
     before, after = (near.pick(hand.points(joints, T)) for joints in (pregrasp, squeeze))
-    offset = (hand.grasp_centres(T) - energy.centre).norm(dim=-1)
+    offset = (hand.grasp_centres(T)[:, None] - energy.centres)[:, 0].norm(dim=-1)
     return LinkMeasures(
-        gap=near.gap, object_normal=near.object_normals, link_normal=near.link_normals, position=near.points - energy.centre,
+        gap=near.gap, object_normal=near.object_normals, link_normal=near.link_normals, position=near.points - energy.centres,
         arriving=near.points - before, closing=after - near.points,
         is_palm=(near.links == hand.palm).to(near.gap).expand_as(near.gap), palm_axes=T[:, :3, :3] @ hand.palm_axes_wrist,
-        terms=terms, size=torch.full_like(offset, energy.length), offset=offset,
+        terms=terms, size=_of_rows(energy.lengths, offset), offset=offset,
     )

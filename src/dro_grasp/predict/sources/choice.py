@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import DistanceField, DistanceFields
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -80,7 +80,7 @@ class ChoiceConfig(Checked):
 
 
 def choice_scores(
-    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], penalties: ChoicePenalties,
+    hand: Hand, field: DistanceField | DistanceFields, points: Float[Tensor, "*b n_points 3"], penalties: ChoicePenalties,
     workspace: Workspace | None = None,
 ) -> Float[Tensor, "*b"]:
     """How well hands suit the object; higher is better, comparable among hands of one kind.
@@ -98,22 +98,21 @@ def choice_scores(
     wanted = distance if place is None else distance.clamp_min(0) + place.distances(points)[0].clamp_min(0)
     finger = hand.finger_of_link[hand.link_index]
 
-    def nearest(part: int, distance: Float[Tensor, "*b n_points"] = distance) -> Float[Tensor, "*b"]:
-        return distance[..., finger == part].amin(-1)
-
-    fingers = [i for i in range(len(hand.fingers)) if bool((finger == i).any())]
-    nearest_of, gap_of = (torch.stack([nearest(i, d) for i in fingers], -1) for d in (distance, wanted))
+    # Points of other parts are infinitely far away.
+    of_finger = finger == hand.pointed_fingers[:, None]
+    nearest_of, gap_of = (torch.where(of_finger, d[..., None, :], torch.inf).amin(-1) for d in (distance, wanted))
     score = -penalties.finger_penetration * (penalties.margin - nearest_of).clamp_min(0).mean(-1)
     score = score - penalties.gap * gap_of.clamp(0, penalties.reach).mean(-1)
     part = (-distance.clamp_min(0) / penalties.nearness).exp() * (finger != PALM)
     mean_normal = (part[..., None] * normal).sum(-2) / part.sum(-1, keepdim=True).clamp_min(LEAST_PART)
     score = score - penalties.imbalance * mean_normal.norm(dim=-1)
-    if bool((finger == PALM).any()):
-        score = score - penalties.palm_penetration * (penalties.margin - nearest(PALM)).clamp_min(0)
+    # A palm without points is infinitely far away.
+    palm = torch.where(finger == PALM, distance, torch.inf).amin(-1)
+    score = score - penalties.palm_penetration * (penalties.margin - palm).clamp_min(0)
     if workspace.surroundings is not None:
         closest = workspace.surroundings.distances(points)[0].amin(-1)
         score = score - penalties.clearance * (penalties.margin - closest).clamp_min(0)
-    some = hand.spread_rank < CROWDING_POINTS
+    some = hand.spread_rank.argsort()[:CROWDING_POINTS].sort().values
     owner = finger[some]
     rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)
     apart = torch.cdist(points[..., some, :], points[..., some, :])

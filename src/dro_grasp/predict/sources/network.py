@@ -8,17 +8,18 @@ random, or face the caller's direction at a random roll.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.devices import Stopwatch, one_thread, side_by_side
+from dro_grasp.devices import Rows, Stopwatch, at_once, on_accelerator, one_thread, side_by_side
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.distance_field import DistanceField, DistanceFields
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -28,7 +29,7 @@ from dro_grasp.network.network import DistanceNetwork, Moves
 from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, approach_cost, wrist_rotations
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
-from dro_grasp.predict.sources.source import Candidates, Progress, Source
+from dro_grasp.predict.sources.source import Asked, Candidates, Progress, Source
 
 HIGHEST_TEMPERATURE = 2.0  # Highest temperature that is accepted; 1 is what the weights were trained for (ours)
 
@@ -52,10 +53,10 @@ class ProposalConfig(Checked):
     """Wrist rotations among which the placement prior chooses each of those that it offers, at least."""
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
     """How one of several placements and z is chosen for each candidate."""
-    batch_size: int = 16
-    """Candidates that are decoded at once."""
-    network_batch_size: int = 4
-    """Candidates that pass the network at once; more do not fit a processor's cache."""
+    batch_size: int | None = None
+    """Candidates that are decoded at once; None takes what suits the device."""
+    network_batch_size: int | None = None
+    """Candidates that pass the network at once; None takes what suits the device."""
 
     def __post_init__(self) -> None:
         """Refuse a temperature out of range."""
@@ -77,13 +78,20 @@ class NetworkSource(Source):
         """
         self.network, self.config = network, config or ProposalConfig()
 
-    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
-    @torch.no_grad()
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
         """See `propose`."""
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch("network", "choose", "decode")
-        made = propose(problem, self.network, num, generator, self.config, watch, progress)
-        return replace(made, seconds=watch.seconds)
+        return self.propose_all([Asked(problem, num, seed)], progress)[0]
+
+    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
+    @torch.no_grad()
+    def propose_all(self, asked: Sequence[Asked], progress: Progress | None = None) -> list[Candidates]:
+        """The same for several objects, whose candidates pass the network together."""
+        watch = Stopwatch("network", "choose", "decode")
+        generators = [torch.Generator().manual_seed(each.seed) for each in asked]
+        problems, counts = [each.problem for each in asked], [each.num for each in asked]
+        made = propose_all(problems, self.network, counts, generators, self.config, watch, progress)
+        seconds = {name: spent / len(made) for name, spent in watch.seconds.items()}
+        return [replace(each, seconds=seconds) for each in made]
 
 
 def propose(
@@ -101,30 +109,87 @@ def propose(
         watch: Counts the seconds of `network`, `choose` and `decode`.
         progress: Called with (candidates decoded, candidates wanted).
     """
-    config = config or ProposalConfig()
-    watch = watch or Stopwatch()
-    hand = problem.thinned(network.config.n_hand)
-    cloud = problem.cloud(network.config.n_object, generator)
-    rivals, draws = (config.choice.placements, config.choice.draws) if network.z_moves else (1, 1)
+    return propose_all([problem], network, [num], [generator], config or ProposalConfig(), watch or Stopwatch(), progress)[0]
+
+
+ON_CPU = 4  # Candidates that pass the network at once on a CPU: more do not fit its cache (ours, timed)
+DECODED_ON_CPU = 16  # Candidates that a CPU decodes at once (ours, timed)
+COPIES = 8  # Copies of its largest tensors that the network needs (ours, counted)
+
+
+@dataclass(frozen=True)
+class _Inputs(Rows):
+    """What the network is given for each candidate, on the device."""
+
+    placement: Float[Tensor, "n p 4 4"]
+    joints: Float[Tensor, "n n_dof"]
+    noise: Float[Tensor, "n p k latent"]
+    which: Int[Tensor, " n"]  # the problem of each
+
+
+def propose_all(
+    problems: Sequence[GraspProblem], network: DistanceNetwork, counts: Sequence[int], generators: Sequence[torch.Generator],
+    config: ProposalConfig, watch: Stopwatch, progress: Progress | None = None,
+) -> list[Candidates]:
+    """Candidates of several objects by one hand, whose energies can be joined; arguments as of `propose`."""
+    first, total = problems[0], sum(counts)
+    hand, rivals, draws = first.thinned(network.config.n_hand), *_choices(network, config)
     with watch("network"):
-        placement = _placements(problem, hand, network, cloud, num, rivals, config, generator)
-        joints = hand.random_open_joints(num, generator)
-        noise = network.sample_latent(num * rivals * draws, generator, _temperature(problem, config)).to(problem.device)
-        noise = noise.unflatten(0, (num, rivals, draws))
+        drawn = [_drawn(network, *each, rivals, draws, config) for each in zip(problems, counts, generators, strict=True)]
+        clouds = torch.stack([cloud for cloud, _ in drawn])
+        which = torch.arange(len(problems)).repeat_interleave(torch.tensor(counts)).to(first.device)
+        parts = {f.name: torch.cat([getattr(own, f.name) for _, own in drawn]) for f in fields(_Inputs)}
+        inputs = _Inputs(**parts | {"which": which})
+        joined = first.field if len(problems) == 1 else DistanceFields.of(
+            [problem.field for problem in problems], [rivals * count for count in counts])
+    size = at_once(first.device, DECODED_ON_CPU, _decoding_bytes(network), config.batch_size)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
-    for start in range(0, num, config.batch_size):
-        part = slice(start, min(start + config.batch_size, num))
-        distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config, watch)
-        with watch("decode"), one_thread():
-            links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
-            solution = distance_matrix.solve(hand.limited_to_use(), links, joints[part])
+    for start in range(0, total, size):
+        part = slice(start, min(start + size, total))
+        field = joined if isinstance(joined, DistanceField) else joined.rows(slice(rivals * start, rivals * part.stop))
+        own = inputs.rows(part)
+        distances = _distances(first, network, clouds, own, field, config, watch)
+        with watch("decode"), one_thread(first.device):
+            links = distance_matrix.decode(hand, distances, clouds[own.which])
+            solution = distance_matrix.solve(hand.limited_to_use(), links, own.joints)
             found.append((solution.T_world_wrist, solution.joints, links.points))
         if progress is not None:
-            progress(part.stop, num)
-    T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
-    grasps = GraspBatch.create(
-        problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
-    return Candidates(grasps, points)
+            progress(part.stop, total)
+    T, q, points = (torch.cat(part).cpu().split(list(counts)) for part in zip(*found, strict=True))
+    return [Candidates(
+        GraspBatch.create(problem.hand, problem.obj, T[i], q[i], seed=generators[i].initial_seed(),
+                          provenance=f"network {network.name}"), points[i]) for i, problem in enumerate(problems)]
+
+
+def _choices(network: DistanceNetwork, config: ProposalConfig) -> tuple[int, int]:
+    """Placements and draws of z for each candidate."""
+    return (config.choice.placements, config.choice.draws) if network.z_moves else (1, 1)
+
+
+def _decoding_bytes(network: DistanceNetwork) -> float:
+    """Memory that a candidate takes from the network's result to the joints."""
+    return 4.0 * COPIES * network.config.n_hand * network.config.n_object
+
+
+def _network_bytes(network: DistanceNetwork, rivals: int, draws: int) -> float:
+    """Memory that a candidate takes in the network: the points of all moved hands, and of both clouds with their neighbours."""
+    sizes = network.config
+    moved = rivals * draws * sizes.n_hand * sizes.latent_head[0]
+    clouds = rivals * (sizes.n_hand + sizes.n_object) * (sizes.neighbours + 2) * sizes.width
+    return 4.0 * (COPIES * moved + clouds) + _decoding_bytes(network)
+
+
+def _drawn(
+    network: DistanceNetwork, problem: GraspProblem, num: int, generator: torch.Generator, rivals: int, draws: int,
+    config: ProposalConfig,
+) -> tuple[Float[Tensor, "m 3"], _Inputs]:
+    """The cloud and all that is random about the candidates of one object, on the device."""
+    hand, cloud = problem.thinned(network.config.n_hand), problem.cloud(network.config.n_object, generator)
+    placement = _placements(problem, hand, network, cloud, num, rivals, config, generator)
+    joints = hand.random_open_joints(num, generator)
+    noise = network.sample_latent(num * rivals * draws, generator, _temperature(problem, config)).to(problem.device)
+    which = torch.zeros(num, dtype=torch.int64, device=noise.device)
+    return cloud, _Inputs(placement, joints, noise.unflatten(0, (num, rivals, draws)), which)
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -160,12 +225,12 @@ def _placements(
     offered = wanted if surroundings is None else max(wanted, CHOICES * num)
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
     rotations = wrist_rotations(hand, max(count, config.prior_choices * offered), direction, spread, generator, up)
-    opened = hand.points(hand.canonical_joints())
-    rotation, position = network.sample_placements(
-        cloud, rotations @ axes, offered, generator, proportions(hand, axes))
+    measures = hand.kept(("proportions", network.config.frame), lambda: proportions(hand, axes))
+    rotation, position = network.sample_placements(cloud, rotations @ axes, offered, generator, measures)
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:
+        opened = hand.points(hand.canonical_joints())
         lack = approach_cost(hand, placed, opened, None if max_tilt else direction, surroundings)
         best = lack.argsort(stable=True)[:wanted]
         rotation, offset = rotation[best] @ axes.mT, offset[best]
@@ -174,37 +239,39 @@ def _placements(
 
 
 def _distances(
-    problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b p 4 4"],
-    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"], config: ProposalConfig, watch: Stopwatch,
+    problem: GraspProblem, network: DistanceNetwork, clouds: Float[Tensor, "o m 3"], inputs: _Inputs,
+    field: DistanceField | DistanceFields, config: ProposalConfig, watch: Stopwatch,
 ) -> Float[Tensor, "b n m"]:
     """D(R,O) of the best of p placements with k draws each of every open hand; the same in every frame."""
     hand = problem.thinned(network.config.n_hand)
-    centre, size = cloud.mean(0), config.network_batch_size
-    field = problem.field  # made before threads ask for it
-    rivals, draws = noise.shape[1:3]
-    each = side_by_side if len(placement) > size else _one_by_one  # all threads for the one part that there is
+    rivals, draws = inputs.noise.shape[1:3]
+    size = at_once(problem.device, ON_CPU, _network_bytes(network, rivals, draws), config.network_batch_size)
+    parts = [slice(start, start + size) for start in range(0, len(inputs.joints), size)]
+    # All threads for the one part that there is; a device computes one after the other.
+    each = _one_by_one if len(parts) == 1 or on_accelerator(problem.device) else side_by_side
+    centres = clouds.mean(1)
 
-    def move(
-        T: Float[Tensor, "b p 4 4"], joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"]
-    ) -> tuple[Moves, Float[Tensor, "c 3 3"]]:
-        T = T.flatten(0, 1)
+    def move(part: slice) -> tuple[Moves, Float[Tensor, "c 3 3"], Float[Tensor, "c 1 1 3"]]:
+        own = inputs.rows(part)
+        T, which = own.placement.flatten(0, 1), own.which.repeat_interleave(rivals)
         axes = T[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
-        centres = centre.expand(len(T), 3)
-        opened = network.to_frame(hand.points(joints.repeat_interleave(rivals, 0), T), centres, axes)
-        obj = network.to_frame(cloud.expand(len(T), -1, -1), centres, axes)
-        return network.move(opened, obj, noise.flatten(0, 1)), axes
+        centre = centres[which]
+        opened = network.to_frame(hand.points(own.joints.repeat_interleave(rivals, 0), T), centre, axes)
+        obj = network.to_frame(clouds[which], centre, axes)
+        return network.move(opened, obj, own.noise.flatten(0, 1)), axes, centre[:, None, None]
 
-    def choose(moves: Moves, axes: Float[Tensor, "c 3 3"]) -> Moves:
+    def choose(moves: Moves, axes: Float[Tensor, "c 3 3"], centre: Float[Tensor, "c 1 1 3"], part: slice) -> Moves:
         points = moves.points @ axes[:, None].mT + centre
-        suits = choice_scores(hand, field, points, config.choice.penalties, problem.workspace)
+        own = field if isinstance(field, DistanceField) else field.rows(slice(rivals * part.start, rivals * part.stop))
+        suits = choice_scores(hand, own, points, config.choice.penalties, problem.workspace)
         best = suits.reshape(-1, rivals * draws).argmax(-1)
         return moves.pick(torch.arange(len(best), device=best.device) * rivals + best // draws, best % draws)
 
     with watch("network"):
-        moves, axes = zip(*each(move, placement.split(size), joints.split(size), noise.split(size)), strict=True)
+        moves, axes, middles = zip(*each(move, parts), strict=True)
     if rivals * draws > 1:
         with watch("choose"):
-            moves = each(choose, moves, axes)
+            moves = each(choose, moves, axes, middles, parts)
     with watch("network"):
         return torch.cat(each(network.distances, moves)).float()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,10 +14,10 @@ from dro_grasp.kinds import Checked
 from dro_grasp.optimize.contacts import ContactConfig
 from dro_grasp.optimize.pinches import PinchConfig, PinchSearch, opposed_pairs
 from dro_grasp.optimize.starts import StartConfig
-from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize_with
+from dro_grasp.optimize.synthesis import Lot, SynthesisConfig, synthesize_all, synthesize_with
 from dro_grasp.predict.admission import facing
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.source import POINTS, Candidates, Progress, Source
+from dro_grasp.predict.sources.source import POINTS, Asked, Candidates, Progress, Source
 
 PINCHES = f"dro-grasp {__version__}, pinches 1"
 """Provenance of pinches; the number counts up when the method changes."""
@@ -53,15 +54,33 @@ class OptimiserSource(Source):
 
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
         """Of several descents for each candidate, those of lowest energy."""
-        wanted, config = problem.constraints, self.config
-        if problem.lies_flat and config.pinch is not None and len(found := pinch(problem, num, seed, config)):
+        return self.propose_all([Asked(problem, num, seed)], progress)[0]
+
+    def propose_all(self, asked: Sequence[Asked], progress: Progress | None = None) -> list[Candidates]:
+        """The same for several objects, whose hands descend together."""
+        config, found = self.config, [self._pinched(*each) for each in asked]
+        lots = [Lot(each.problem.energy(config.synthesis.energy), each.problem.obj, config.starts_per_candidate * each.num,
+                    each.seed, self._synthesis(each.problem)) for each, pinched in zip(asked, found, strict=True)
+                if pinched is None]
+        made = iter(synthesize_all(lots, progress) if lots else [])
+        return [self._best(each.problem, next(made), each.num) if pinched is None else pinched
+                for each, pinched in zip(asked, found, strict=True)]
+
+    def _pinched(self, problem: GraspProblem, num: int, seed: int) -> Candidates | None:
+        """Pinches of what lies flat on a table; None for other things, and where there are none."""
+        if problem.lies_flat and self.config.pinch is not None and len(found := pinch(problem, num, seed, self.config)):
             return replace(Candidates.of(problem, found, self.n_points), exact=True)
-        starts = replace(config.synthesis.starts, direction=wanted.direction, max_tilt=wanted.max_tilt,
-                         contact_region=wanted.contact_region)
-        synthesis = replace(config.synthesis, starts=starts)
-        count = config.starts_per_candidate * num
-        grasps = synthesize_with(problem.energy(synthesis.energy), problem.obj, count, seed, synthesis, progress)
-        kept = facing(problem, grasps, config.farthest_direction)
+        return None
+
+    def _synthesis(self, problem: GraspProblem) -> SynthesisConfig:
+        """The descent, which starts as the constraints say."""
+        wanted, synthesis = problem.constraints, self.config.synthesis
+        return replace(synthesis, starts=replace(
+            synthesis.starts, direction=wanted.direction, max_tilt=wanted.max_tilt, contact_region=wanted.contact_region))
+
+    def _best(self, problem: GraspProblem, grasps: GraspBatch, num: int) -> Candidates:
+        """Those of lowest energy that face the object as they should."""
+        kept = facing(problem, grasps, self.config.farthest_direction)
         found = Candidates.of(problem, grasps[kept][:num].poses_only(), self.n_points)
         return replace(found, turned=min(int((~kept).sum()), num - len(found)))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -79,6 +80,14 @@ class Candidates:
             tuple(name for p in parts for name in p.origin), sum(p.turned for p in parts), seconds)
 
 
+class Asked(NamedTuple):
+    """What a source is asked for: of a problem so many candidates, with this seed."""
+
+    problem: GraspProblem
+    num: int
+    seed: int
+
+
 class Source(ABC):
     """Proposes grasps of any object by any hand; whatever it has to load is loaded once."""
 
@@ -97,6 +106,12 @@ class Source(ABC):
             seed: The same seed gives the same candidates.
             progress: See `Progress`.
         """
+
+    def propose_all(
+        self, asked: Sequence[Asked], progress: Progress | None = None
+    ) -> Sequence[Candidates | GraspBatch]:
+        """Candidates of several objects by one hand; those of each are as if it were asked for alone."""
+        return [self.propose(*each, progress) for each in asked]
 
     def knows(self, hand: Hand) -> bool:
         """Whether it proposes grasps of this hand at all."""
@@ -117,9 +132,18 @@ def ask(
         problem: See `Source.propose`, as `num`, `seed` and `progress`.
         n_points: Hand points to keep where the source states none.
     """
-    watch = Stopwatch()
+    return ask_all(source, [Asked(problem, num, seed)], progress, n_points)[0]
+
+
+def ask_all(
+    source: Source, asked: Sequence[Asked], progress: Progress | None = None, n_points: int = POINTS
+) -> list[Candidates]:
+    """The same for several problems with one hand, together where the source can; each takes an equal share of the time."""
+    watch, found = Stopwatch(), []
     with watch(source.name):
-        made = source.propose(problem, num, seed, progress)
-    if isinstance(made, GraspBatch):
-        made = Candidates.of(problem, made, n_points)
-    return replace(made, origin=(source.name,) * len(made), seconds=made.seconds or watch.seconds)
+        proposed = [source.propose(*asked[0], progress)] if len(asked) == 1 else source.propose_all(asked, progress)
+    seconds = {name: spent / len(asked) for name, spent in watch.seconds.items()}
+    for each, made in zip(asked, proposed, strict=True):
+        own = Candidates.of(each.problem, made, n_points) if isinstance(made, GraspBatch) else made
+        found.append(replace(own, origin=(source.name,) * len(own), seconds=own.seconds or seconds))
+    return found
