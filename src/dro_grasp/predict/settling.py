@@ -183,15 +183,15 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     grasps = problem.on_table(complete(problem, grasps.without("score")))
     if problem.lies_flat:
         return _lifted(problem, grasps, config)
-    closed = settle(hand, obj, grasps, config.closing)
+    closed = settle(hand, obj, grasps, config.closing, device=str(problem.device))
     moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     rows = near.nonzero()[:, 0]
     better = problem.on_table(_bettered(problem, grasps, closed, still, near, config)[rows])
     asked = weight_config(problem, config)
-    done = pressed(hand, obj, better, config.protocol, config=asked)
+    done = pressed(hand, obj, better, config.protocol, config=asked, device=str(problem.device))
     better = problem.on_table(done.grasps)
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked, device=str(problem.device))
     better = better.replace(payload=done.payloads(~gives_way(state), asked.payload))
     return _judged(problem, grasps, rows, moved, better, state, squeeze, config)
 
@@ -227,7 +227,8 @@ def weigh_settled(
     What held the object's mass as it settled carries that at least, and what gave way carries less.
     """
     asked = weight_config(problem, settling)
-    found = weigh(problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config)
+    found = weigh(
+        problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config, device=str(problem.device))
     if asked.pull == 0:
         return found
     pulled, before = asked.pull * problem.solid.mass, grasps.payload
