@@ -18,7 +18,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation import warp_worlds
+from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.payload import PayloadConfig, given_way, payloads
@@ -83,6 +83,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Steps]:
     def install(*change: Callable[[State, np.ndarray], None]) -> Steps:
         made = Steps(*change)
         monkeypatch.setattr(warp_worlds, "_graphs", made)
+        monkeypatch.setattr(rollout_module, "FEW", 0)
         return made
 
     return install
@@ -183,6 +184,8 @@ def test_room_grows_for_contacts_at_once_and_for_constraints_where_many_worlds_l
 def test_a_device_without_the_extra_says_what_to_install(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    simulate(hand, obj, grasps, device="cuda")  # they are few
+    monkeypatch.setattr(rollout_module, "FEW", 0)
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "mujoco_warp" else object())
     warp_worlds._modules.cache_clear()
     with pytest.raises(OptionError, match=r"mujoco_warp.*dro-grasp\[gpu\]"):
@@ -233,7 +236,8 @@ def _around(hand: Hand, obj: ObjectModel) -> GraspBatch:
 
 
 @pytest.mark.gpu
-def test_a_gpu_judges_as_the_processor_does() -> None:
+def test_a_gpu_judges_as_the_processor_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout_module, "FEW", 0)
     hand, obj = load_hand("gripper3"), load_object("cube")
     grasps = settle(hand, obj, _around(hand, obj))
     found = simulate(hand, obj, grasps, "strict", device="cuda", confirm=False)

@@ -84,6 +84,7 @@ def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict
 RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours
 CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
 DEVICE_CHUNK = 2048  # The same on a device (ours)
+FEW = 64  # Fewer grasps run on the processor, which is done before a device has begun (ours)
 GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
 RESTS = 0.003  # Gap up to which an object counts as lying on a table [m]. Ours
 
@@ -347,6 +348,8 @@ def rollouts(
     scene: TrialScene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None, device: str = "cpu"
 ) -> Iterator[tuple[GraspBatch, Rollout]]:
     """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
+    if len(grasps) < FEW and device != WARP:
+        device = "cpu"
     centre = torch.as_tensor(scene.obj.centre_of_mass)
     for part in grasps.in_parts(CHUNK if on_processor(device) else DEVICE_CHUNK):
         if scene.protocol.closing:

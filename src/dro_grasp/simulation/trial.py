@@ -44,7 +44,7 @@ def simulate(
         workers: Threads; all cores by default. The result does not depend on it.
         progress: Called with (grasps evaluated, grasps in all).
         another: Take the object although the grasps were made for one of other name and content.
-        device: `cuda` runs thousands of trials together by MuJoCo Warp (extra `gpu`), in single precision.
+        device: `cuda` runs many trials together by MuJoCo Warp (extra `gpu`), in single precision; few run on the processor.
         confirm: Let the processor judge again what holds on a device; what fails there, fails.
 
     Raises:
@@ -59,7 +59,7 @@ def simulate(
     results, done = [], 0
     for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
         result = _evaluated(part, rollout, workers)
-        if confirm and not on_processor(device):
+        if confirm and not on_processor(rollout.device):
             result = _confirmed(scene, part, result, workers)
         results.append(result)
         done += len(part)
