@@ -179,6 +179,8 @@ def test_room_grows_for_contacts_at_once_and_for_constraints_where_many_worlds_l
     few[:50] = kinds.NEFC
     assert warp_worlds._larger(Room(), few) == Room(rows=2 * Room().rows)
     assert warp_worlds._larger(Room(), none + kinds.NARROWPHASE) == Room(contacts=2 * Room().contacts)
+    large = Room(warp_worlds.LARGEST_ROOM, warp_worlds.LARGEST_ROOM)
+    assert warp_worlds._larger(large, none + kinds.CCD) == large
 
 
 def test_a_device_without_the_extra_says_what_to_install(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dro_grasp.extras import require_extra
-from dro_grasp.simulation.scene import TrialScene
+from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene
 from dro_grasp.simulation.worlds import STATE, WARP, ProcessorWorlds
 
 INPUTS = (*STATE, "ctrl", "xfrc_applied", "mocap_pos", "mocap_quat")  # Fields of MjData that steps depend on
@@ -25,7 +25,8 @@ MOST = 4096  # Worlds that step together. Ours: more gain nothing on an H100
 FEWEST = 128  # Worlds of the smallest graph; there is one for each power of two. Ours: fewer are no faster
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
 SPARE = 0.01  # Share of worlds that may have more constraints than fit; they run on the processor (ours)
-CACHED = 8  # Graphs that are kept, with the memory of their worlds (ours)
+LARGEST_ROOM = 1024  # Most contacts, and most constraints, that a world gets memory for (ours)
+CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,10 @@ class Room:
 
     contacts: int = 128  # pairs of shapes that are near each other, on average
     rows: int = 128  # constraints, at most: four for each contact with the object
+
+    def twice(self, name: str) -> Room:
+        """Twice as much of one, up to a limit."""
+        return replace(self, **{name: min(2 * getattr(self, name), LARGEST_ROOM)})
 
 
 class WarpWorlds:
@@ -77,7 +82,6 @@ class _Graphs:
     def __init__(self, scene: TrialScene, device: str, fields: tuple[str, ...]) -> None:
         self._scene, self._device, self._fields = scene, device, fields
         self._room, self._lock = Room(), threading.Lock()
-        self._made = lru_cache(maxsize=CACHED)(self._make)
 
     def step(
         self, inputs: dict[str, Float[np.ndarray, "k *_"]], fields: dict[str, Float[np.ndarray, "k *_"]], count: int
@@ -87,14 +91,12 @@ class _Graphs:
         number = max(FEWEST, 1 << (worlds - 1).bit_length())
         with self._lock:
             while True:
-                after, overflow = self._made(number, self._room).step(inputs, fields, count)
+                graph = _graph(self._scene, self._device, self._fields, number, self._room)
+                after, overflow = graph.step(inputs, fields, count)
                 larger = _larger(self._room, overflow[:worlds])
                 if larger == self._room:
                     return {name: values[:worlds] for name, values in after.items()}, overflow[:worlds] != 0
                 self._room = larger
-
-    def _make(self, number: int, room: Room) -> _Graph:
-        return _Graph(self._scene.model, self._device, number, self._fields, room)
 
 
 def _larger(room: Room, overflow: Int[np.ndarray, " k"]) -> Room:
@@ -102,9 +104,9 @@ def _larger(room: Room, overflow: Int[np.ndarray, " k"]) -> Room:
     kinds = _modules()[1].OverflowType
     shared = kinds.BROADPHASE | kinds.NARROWPHASE | kinds.CCD
     if (overflow & shared).any():
-        return replace(room, contacts=2 * room.contacts)
+        return room.twice("contacts")
     if (overflow != 0).mean() > SPARE:
-        return replace(room, rows=2 * room.rows)
+        return room.twice("rows")
     return room
 
 
@@ -149,9 +151,14 @@ class _Graph:
             self._wp.capture_launch(self._graph)
 
 
-@lru_cache(maxsize=CACHED)
+@lru_cache(maxsize=CACHED_SCENES)
 def _graphs(scene: TrialScene, device: str, fields: tuple[str, ...]) -> _Graphs:
     return _Graphs(scene, device, fields)
+
+
+@lru_cache(maxsize=CACHED)
+def _graph(scene: TrialScene, device: str, fields: tuple[str, ...], number: int, room: Room) -> _Graph:
+    return _Graph(scene.model, device, number, fields, room)
 
 
 @cache
