@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import mujoco
 import mujoco.batch
@@ -15,6 +15,7 @@ STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a simulation needs
 WARP = "warp"  # In place of a device: MuJoCo Warp on the processor, which is slow and shows what a device would do
 
 
+@runtime_checkable
 class Worlds(Protocol):
     """Simulations of one scene; arrays have a row for each and are written in place."""
 
