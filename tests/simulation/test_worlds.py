@@ -13,6 +13,7 @@ import torch
 from dro_grasp import extras
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -109,6 +110,18 @@ def test_trials_see_the_same_state_forces_masses_friction_and_gains_on_a_device(
     same(found, simulate(hand, obj, grasps, rules))
     assert made.calls
     assert rules is not ROBUST or {"geom_friction", "body_mass", "actuator_gainprm"} <= set(made.fields)
+
+
+def test_a_table_is_there_on_a_device(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    steps()
+    assert obj.vertices is not None
+    plane = torch.tensor([[0.0, 0.0, 1.0, float(obj.vertices[:, 2].min())]])
+    laid = grasps.replace(extra={**grasps.extra, TABLE: plane.repeat(len(grasps), 1)})
+    found = simulate(hand, obj, laid, device="cuda", confirm=False)
+    same(found, simulate(hand, obj, laid))
+    assert not torch.equal(found.closing_shift, simulate(hand, obj, grasps).closing_shift)
 
 
 def test_settling_and_the_state_of_grasps_are_the_same_on_a_device(
