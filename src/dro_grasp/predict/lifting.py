@@ -52,7 +52,7 @@ def lifted(
     short, n = replace(weight, pulling=config.pulling), len(grasps)
     asked = weight.margin / MARGIN if weight.margin > 0 else 1.0
     tried = GraspBatch.concatenate([firmer(problem, grasps, asked * strength) for strength in config.strengths])
-    state, squeeze = grasp_state(problem.hand, problem.solid, tried, protocol, config=short)
+    state, squeeze = grasp_state(problem.hand, problem.solid, tried, protocol, config=short, device=str(problem.device))
     best = gives(state, protocol).reshape(-1, n).argmin(0) * n + torch.arange(n)
     found, state, squeeze = tried[best], state.rows(best), squeeze.rows(best)
     near = gives(state, protocol) < config.near
@@ -61,10 +61,11 @@ def lifted(
         return found.replace(payload=torch.zeros(n)), state, squeeze
     # Pressing for no weight leaves the squeeze as it is, gentle enough where that is asked, and tells the payload.
     firm, unchanged = found[held], replace(weight, margin=0.0)
-    pressed = problem.on_table(press(problem.hand, problem.solid, firm, protocol, config=unchanged))
+    pressed = problem.on_table(press(
+        problem.hand, problem.solid, firm, protocol, config=unchanged, device=str(problem.device)))
     if weight.max_force == math.inf:
         pressed = firm.replace(payload=pressed.payload)
-    longer = grasp_state(problem.hand, problem.solid, pressed, protocol, config=weight)
+    longer = grasp_state(problem.hand, problem.solid, pressed, protocol, config=weight, device=str(problem.device))
     order = torch.cat([held, others]).argsort()
     found = GraspBatch.concatenate([pressed, found[others].replace(payload=torch.zeros(len(others)))])[order]
     return found, join([longer[0], state.rows(others)]).rows(order), join([longer[1], squeeze.rows(others)]).rows(order)

@@ -32,11 +32,11 @@ class GraspProblem:
     """
 
     hand: Hand
-    """On the CPU, where grasps and trials stay."""
+    """On the CPU, where grasps stay."""
     obj: ObjectModel
     """A mesh or a bare point cloud."""
     device: torch.device | str = "cpu"
-    """Where the network and the grasp energy run."""
+    """Where the network, the grasp energy and, on CUDA, the simulations of settling run."""
     constraints: Constraints = field(default_factory=Constraints)
     """What grasps have to respect."""
     _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)

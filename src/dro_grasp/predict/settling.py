@@ -214,7 +214,7 @@ def settle_all(
     config = config or SettleConfig()
     whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
         problems, batches, strict=True)]
-    first = [None if problem.lies_flat else settle(problem.hand, problem.solid, grasps, config.closing)
+    first = [None if problem.lies_flat else settle(problem.hand, problem.solid, grasps, config.closing, device=str(problem.device))
              for problem, grasps in zip(problems, whole, strict=True)]
     hanging = [i for i, closed in enumerate(first) if closed is not None]
     closed = [_Closed.of(problems[i], whole[i], first[i], config) for i in hanging]
@@ -255,9 +255,9 @@ def _closed_again(
     """What becomes of better grasps as they squeeze for the weight and close once more."""
     hand, obj, asked = problem.hand, problem.solid, weight_config(problem, config)
     rows = (moved < config.lost).nonzero()[:, 0]
-    done = pressed(hand, obj, problem.on_table(better[rows]), config.protocol, config=asked)
+    done = pressed(hand, obj, problem.on_table(better[rows]), config.protocol, config=asked, device=str(problem.device))
     better = problem.on_table(done.grasps)
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked)
+    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked, device=str(problem.device))
     better = better.replace(payload=done.payloads(~gives_way(state), asked.payload))
     return _judged(problem, grasps, rows, moved, better, state, squeeze, config)
 
@@ -293,7 +293,8 @@ def weigh_settled(
     What held the object's mass as it settled carries that at least, and what gave way carries less.
     """
     asked = weight_config(problem, settling)
-    found = weigh(problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config)
+    found = weigh(
+        problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config, device=str(problem.device))
     if asked.pull == 0:
         return found
     pulled, before = asked.pull * problem.solid.mass, grasps.payload

@@ -21,7 +21,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, servo_torques
 from dro_grasp.simulation.piercing import pierced
-from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, pressing
+from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, hardest, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
 from dro_grasp.simulation.scene import TrialScene, scene_of
@@ -75,8 +75,9 @@ class Pressed:
         """Payloads of the grasps in these rows; NaN in the others, since payloads take time [kg]."""
         parts = []
         for squeezes, wanted in zip(self.squeezes, rows.split([len(s.joints) for s in self.squeezes]), strict=True):
-            found, still = torch.full((len(wanted),), torch.nan), torch.zeros(int(wanted.sum()))
-            found[wanted] = payloads(squeezes.rows(wanted), still, still, config)
+            found, asked = torch.full((len(wanted),), torch.nan), squeezes.rows(wanted.to(squeezes.joints.device))
+            still = asked.joints.new_zeros(len(asked.joints))
+            found[wanted] = payloads(asked, still, still, config).cpu()
             parts.append(found)
         return torch.cat([torch.zeros(0), *parts])
 
@@ -91,7 +92,7 @@ class Squeeze(Rows):
 
 def press(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    config: WeightConfig | None = None, workers: int | None = None
+    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
 ) -> GraspBatch:
     """The grasps where closing leaves hand and object, squeezing for the object's weight, with payloads.
 
@@ -99,36 +100,36 @@ def press(
     closing is unsound, or loses the object, stays where it is. Arguments and errors are those of `simulate`.
     """
     config = config or WeightConfig()
-    done = pressed(hand, obj, grasps, protocol, config=config, workers=workers)
+    done = pressed(hand, obj, grasps, protocol, config=config, workers=workers, device=device)
     return done.grasps.replace(payload=done.payloads(torch.ones(len(grasps), dtype=torch.bool), config.payload))
 
 
 def pressed(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    config: WeightConfig | None = None, workers: int | None = None
+    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
 ) -> Pressed:
     """As `press`, with payloads only of what they are asked for."""
     config, scene, parts = config or WeightConfig(), scene_of(hand, obj, grasps, protocol), [grasps[:0]]
     squeezes = []
-    for part, rollout in rollouts(scene, hand, grasps, workers):
+    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         joints, poses = held(part, rollout, sound)
         reached = torch.from_numpy(rollout.poses()[0]).to(joints)
-        chosen = squeezes_of(hand, contact_forces(rollout), reached, part.squeeze_joints, config)
-        targets = chosen.targets(torch.from_numpy(rollout.mass).to(joints)[:, None])[:, 0]
+        chosen = squeezes_of(hand, contact_forces(rollout), reached, part.squeeze_joints, config, rollout.place)
+        targets = chosen.targets(torch.from_numpy(rollout.mass).to(chosen.joints)[:, None])[:, 0].cpu()
         squeezes.append(chosen)
         parts.append(part.replace(
             T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints)))
     found = GraspBatch.concatenate(parts)
     if math.isfinite(config.max_force):
-        found = _gentle(scene, found, NEARLY * config.max_force, workers)
+        found = _gentle(scene, found, NEARLY * config.max_force, workers, device)
     return Pressed(found, tuple(squeezes))
 
 
 def grasp_state(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    config: WeightConfig | None = None, workers: int | None = None
+    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
 ) -> tuple[GraspState, Squeeze]:
     """Close hands as a trial does, look at what holds the object then, and pull at it by its weight.
 
@@ -137,7 +138,7 @@ def grasp_state(
     scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
     parts, squeezes = [GraspState(**none)], [Squeeze(grasps.joints[:0], grasps.joints.new_zeros(0))]
-    for part, rollout in rollouts(scene, hand, grasps, workers):
+    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
         closed, state = _observed(rollout)
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
@@ -154,7 +155,7 @@ def join(parts: Sequence[Held]) -> Held:
     return type(parts[0])(**{f.name: torch.cat([getattr(one, f.name) for one in parts]) for f in fields(parts[0])})
 
 
-def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None) -> GraspBatch:
+def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | None, device: str) -> GraspBatch:
     """The grasps with squeezes as near to the grasp as it takes for no link to press harder than `most` after closing [N]."""
     firm, low, high = grasps.squeeze_joints, torch.zeros(len(grasps)), torch.ones(len(grasps))
 
@@ -164,7 +165,7 @@ def _gentle(scene: TrialScene, grasps: GraspBatch, most: float, workers: int | N
     share = high
     for _ in range(EASINGS):
         fits = []
-        for _, rollout in rollouts(scene, scene.hand, eased(share), workers):
+        for _, rollout in rollouts(scene, scene.hand, eased(share), workers, device=device):
             rollout.close()
             fits += [c.hardest_link <= most for c in contact_forces(rollout)]
         fit = torch.tensor(fits, dtype=torch.bool)
@@ -203,7 +204,7 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     }
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
-    missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction)
+    missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32).to(rollout.place), friction).cpu()
     return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan))
 
 
@@ -239,9 +240,10 @@ class WeightConfig(Checked):
 
 def squeezes_of(
     hand: Hand, contacts: list[ContactForces], joints: Float[Tensor, "n n_dof"], base: Float[Tensor, "n n_dof"],
-    config: WeightConfig,
+    config: WeightConfig, device: torch.device | str = "cpu",
 ) -> Squeezes:
-    """How closed hands squeeze for a mass: towards the base, and by the torques that hold its weight."""
+    """How closed hands squeeze for a mass: towards the base, and by the torques that hold its weight; on a device."""
+    hand, joints, base = hand.to(device), joints.to(device), base.to(device)
     touch = pressing(hand, contacts, joints, max(config.contacts, config.payload.contacts))
     force = weight_forces(touch.hardest(config.contacts), joints.new_ones(len(contacts)), config)
     force = torch.nn.functional.pad(force, (0, 0, 0, touch.on.shape[1] - force.shape[1]))
@@ -284,20 +286,16 @@ def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], frictio
     # Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
     # share of the push that stays unanswered.
     n, most = len(contacts), min(CONTACTS, max((len(c.pressure) for c in contacts), default=0)) or 1
-    normal, arm = torch.zeros(n, most, 3), torch.zeros(n, most, 3)
-    normal[..., 2], pressure = 1.0, torch.zeros(n, most)
-    for i, c in enumerate(contacts):
-        kept = np.argsort(-c.pressure)[:most]
-        for table, values in ((normal, c.normal), (arm, c.arm), (pressure, c.pressure)):
-            table[i, :len(kept)] = torch.as_tensor(values[kept], dtype=torch.float32)
+    normal, arm, _, _, pressure, _ = hardest(contacts, most)
+    normal, arm, pressure = (torch.from_numpy(table).to(mass) for table in (normal, arm, pressure))
     on = (pressure > 0).float()
     cone = friction_cone(normal, friction, EDGES)
     scale = (pressure / (UNIT * mass[:, None]))[..., None, None]
     wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1) * scale
-    same = CHANGE * torch.eye(most).repeat_interleave(EDGES, 1) * on.repeat_interleave(EDGES, 1)[:, None]
+    same = CHANGE * torch.eye(most).to(mass).repeat_interleave(EDGES, 1) * on.repeat_interleave(EDGES, 1)[:, None]
     matrix = torch.cat([wrench.flatten(1, 2).mT, same], 1)
-    push = torch.as_tensor(FORCES, dtype=torch.float32) * PUSH / UNIT
-    answer = torch.cat([-push, torch.zeros(6, 3)], 1).mT.expand(n, 6, 6)
+    push = torch.as_tensor(FORCES).to(mass) * PUSH / UNIT
+    answer = torch.cat([-push, torch.zeros_like(push)], 1).mT.expand(n, 6, 6)
     goal = torch.cat([answer, (CHANGE * on)[..., None].expand(n, most, 6)], 1)
     x = nonnegative_least_squares(matrix, goal, RIDGE, STEPS)
     missing = (matrix @ x - goal).norm(dim=1).clamp_max(NO_ANSWER)

@@ -192,9 +192,10 @@ RELAXED = 1.6  # Over-relaxation. Source: Boyd et al. 2011
 def _crossing(masses: Float[Tensor, " m"], used: Float[Tensor, "n m"]) -> Float[Tensor, " n"]:
     """Where `used` exceeds 1 after the largest mass at which it does not, by logarithms; 0 where it does at all masses."""
     # A squeeze that is not quite balanced moves light objects more than their weight does, so the smallest masses may exceed.
-    held, numbers, log = used <= 1, torch.arange(len(masses)), masses.log()
+    held, numbers, log = used <= 1, torch.arange(len(masses), device=used.device), masses.log()
     last = torch.where(held, numbers, -1).amax(1)
-    before, rows, use = last.clamp(0, len(masses) - 2), torch.arange(len(used)), used.clamp_min(1e-6).log()
+    rows = torch.arange(len(used), device=used.device)
+    before, use = last.clamp(0, len(masses) - 2), used.clamp_min(1e-6).log()
     low, high = use[rows, before], use[rows, before + 1]
     between = (log[before] - low / (high - low).clamp_min(1e-6) * (log[before + 1] - log[before])).exp()
     found = torch.where(last == len(masses) - 1, masses[-1], between)

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import mujoco
+import mujoco.batch
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.devices import cores
 from dro_grasp.simulation.scene import CACHED_SCENES, OBJECT_GROUP, TrialScene
 
 GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
@@ -32,20 +34,31 @@ class Bone:
     beyond: float  # How far the finger goes on from there [m]
 
 
-def pierced(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, " n"]:
+def pierced(scene: TrialScene, qpos: Float[np.ndarray, "n nq"], workers: int | None = None) -> Float[np.ndarray, " n"]:
     """How much of a finger is behind a surface that its axis crosses, in each configuration [m]; 0 where none crosses."""
-    model, behind = scene.model, np.zeros(len(qpos))
-    data, groups = mujoco.MjData(model), (np.arange(mujoco.mjNGROUP) == OBJECT_GROUP).astype(np.uint8)
-    for i, q in enumerate(qpos):
-        data.qpos[:] = np.nan_to_num(q)
-        mujoco.mj_kinematics(model, data)
-        for bone in bones(scene):
-            place, turn = data.xpos[bone.body], data.xmat[bone.body].reshape(3, 3)
-            along = turn @ (bone.end - bone.start)
-            hit = mujoco.mj_ray(model, data, place + turn @ bone.start, along, groups, False, -1, None)
-            if 0 <= hit <= 1:
-                behind[i] = max(behind[i], (1 - hit) * float(np.linalg.norm(along)) + bone.beyond)
-    return behind
+    fingers = bones(scene)
+    if not fingers or not len(qpos):
+        return np.zeros(len(qpos))
+    batch = mujoco.batch.Batch(scene.model, nsim=len(qpos), nthread=min(workers or cores(), len(qpos)))
+    start, along = _in_place(fingers, qpos, batch)
+    groups = (np.arange(mujoco.mjNGROUP) == OBJECT_GROUP).astype(np.uint8)
+    hit = batch.ray(start, along, groups, False)[0]
+    behind = (1 - hit) * np.linalg.norm(along, axis=2) + np.array([bone.beyond for bone in fingers])
+    return np.where((hit >= 0) & (hit <= 1), behind, 0.0).max(1)
+
+
+def _in_place(
+    fingers: tuple[Bone, ...], qpos: Float[np.ndarray, "n nq"], batch: mujoco.batch.Batch
+) -> tuple[Float[np.ndarray, "n b 3"], Float[np.ndarray, "n b 3"]]:
+    """Where each bone begins in each configuration, and the way to its end [m]; the batch has the configurations then."""
+    places, turns = batch.bind("xpos"), batch.bind("xmat")
+    batch.bind("qpos")[:] = np.nan_to_num(qpos)
+    batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+    bodies = np.array([bone.body for bone in fingers])
+    turn = turns[:, bodies].reshape(len(qpos), len(fingers), 3, 3)
+    start, along = (np.einsum("nbij,bj->nbi", turn, local) for local in (
+        np.stack([bone.start for bone in fingers]), np.stack([bone.end - bone.start for bone in fingers])))
+    return places[:, bodies] + start, along
 
 
 @lru_cache(maxsize=CACHED_SCENES)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.devices import Rows
@@ -99,25 +99,28 @@ class Pressing(Rows):
 
 def pressing(hand: Hand, contacts: Sequence[ContactForces], joints: Float[Tensor, "n n_dof"], most: int) -> Pressing:
     """The contacts that press hardest, of each grasp, with the hand at these joints."""
-    n, tree = len(contacts), hand.tree
-    normal, arm, point = (joints.new_zeros(n, most, 3) for _ in range(3))
-    normal[..., 2], on, pressure = 1.0, joints.new_zeros(n, most), joints.new_zeros(n, most)
-    link = torch.zeros(n, most, dtype=torch.int64)
+    tree, (normal, arm, point, link, pressure, on) = hand.tree, hardest(contacts, most)
+    normal, arm, point, pressure, on = (torch.from_numpy(table).to(joints) for table in (normal, arm, point, pressure, on))
+    link = torch.from_numpy(link).to(joints.device).clamp_min(0)
+    pose = tree.forward(joints)
+    axes = tree.motion_axes(pose)[1]
+    spin = torch.einsum("nkl,nlc,ld->nkcd", tree.descends[link].to(axes), axes, tree.link_coupling)
+    moves = hand.movable * on[..., None, None]
+    return Pressing(normal, arm, on, link, pressure, tree.point_jacobian(pose, point, link) * moves, spin * moves)
+
+
+def hardest(contacts: Sequence[ContactForces], most: int) -> tuple[Shaped[np.ndarray, "n k *_"], ...]:
+    """Normal, arm, point, link, pressure and whether there is a contact, of those that press hardest in each grasp."""
+    n = len(contacts)
+    normal, arm, point = np.zeros((3, n, most, 3))
+    normal[..., 2] = 1.0
+    link, (pressure, on) = np.zeros((n, most), int), np.zeros((2, n, most))
     for i, c in enumerate(contacts):
         kept = np.argsort(-c.pressure)[:most]
         for table, values in ((normal, c.normal), (arm, c.arm), (point, c.point), (link, c.link), (pressure, c.pressure)):
-            table[i, :len(kept)] = torch.as_tensor(values[kept]).to(table)
+            table[i, :len(kept)] = values[kept]
         on[i, :len(kept)] = 1
-    link, jacobians, spins = link.clamp_min(0), [], []
-    for q, at, own in zip(joints, point, link, strict=True):
-        pose = tree.forward(q)
-        jacobians.append(tree.point_jacobian(pose, at, own))
-        axes = tree.motion_axes(pose)[1]
-        spins.append(torch.einsum("kl,lc,ld->kcd", tree.descends[own].to(axes), axes, tree.link_coupling))
-    moves = hand.movable * on[..., None, None]
-    shape = (n, most, 3, tree.n_dof)
-    stacked = (torch.stack(t) if t else joints.new_zeros(shape) for t in (jacobians, spins))
-    return Pressing(normal, arm, on, link, pressure, *(t * moves for t in stacked))
+    return normal, arm, point, link, pressure, on
 
 
 def by_link(force: Float[Tensor, "n k"], contacts: Pressing) -> Float[Tensor, "n k"]:

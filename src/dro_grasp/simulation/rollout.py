@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
-import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,6 +26,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.protocols import Perturbations
 from dro_grasp.simulation.scene import TABLE_AWAY, TrialScene, object_mass
+from dro_grasp.simulation.worlds import STATE, WARP, on_processor, worlds
 
 FACTORS = ("friction", "mass", "gain")  # Conditions that are factors, as in Perturbations
 
@@ -83,9 +83,10 @@ def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict
 
 RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours
 CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
+DEVICE_CHUNK = 2048  # The same on a device (ours)
+FEW = 64  # Fewer grasps run on the processor, which is done before a device has begun (ours)
 GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
 RESTS = 0.003  # Gap up to which an object counts as lying on a table [m]. Ours
-STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a trial needs to continue from an earlier moment
 
 
 @dataclass(frozen=True)
@@ -126,12 +127,13 @@ class Rollout:
 
     def __init__(
         self, scene: TrialScene, grasps: GraspBatch, workers: int, stride: int | None = None,
-        conditions: Conditions | None = None,
+        conditions: Conditions | None = None, device: str = "cpu",
     ) -> None:
         """Place hands and objects.
 
         Grasps, one at least, state pregrasp and squeeze if the protocol closes the hand. A frame is recorded every `stride`
-        time steps, none by default; `workers` are threads, and `conditions` differ from the protocol.
+        time steps, none by default; `workers` are threads, and `conditions` differ from the protocol. The device is as of
+        `worlds`.
         """
         rules = scene.protocol
         start, target = grasps.joints, grasps.joints
@@ -142,10 +144,10 @@ class Rollout:
         self.mass = np.full(self.size, object_mass(scene.obj, rules))
         if conditions is not None:
             grasps = conditions.displaced(grasps, scene.obj.centre_of_mass)
-        self.batch = mujoco.batch.Batch(scene.model, nsim=self.size, nthread=min(workers, self.size))
+        self.device = device
+        self.batch = worlds(scene, self.size, workers, device)
         if conditions is not None:
             self._change(conditions)
-        self.overflowed = np.zeros(self.size, bool)
         self.qpos, self.ctrl, self.force = (self.batch.bind(n) for n in ("qpos", "ctrl", "xfrc_applied"))
         self.qpos[:] = scene.qpos(grasps.T_object_wrist, start)
         postures = [start, grasps.joints, target] if rules.gradual else [target]
@@ -155,6 +157,11 @@ class Rollout:
         if scene.table:
             self._lay(grasps)
         self.frames = [] if stride is None else [self.poses()]
+
+    @property
+    def place(self) -> torch.device:
+        """Where tensors are that belong to many grasps."""
+        return torch.device("cpu" if self.device == WARP or on_processor(self.device) else self.device)
 
     def close(self) -> ObjectState:
         """Move to the target for the protocol's closing time; a table is there until then, and gone afterwards."""
@@ -246,8 +253,7 @@ class Rollout:
         rows = np.arange(self.size) if rows is None else rows
         pose = self.qpos[rows][:, self.scene.object_qpos]
         rotation = _matrices(pose[:, 3:])
-        # MuJoCo resets a trial that explodes and continues; only the warning tells.
-        unstable = self.batch.warning[rows][:, :, 1].any(1) | ~np.isfinite(self.qpos[rows]).all(1) | self.overflowed[rows]
+        unstable = self.batch.unsound[rows] | ~np.isfinite(self.qpos[rows]).all(1)
         return ObjectState(pose[:, :3], rotation, ~unstable)
 
     def poses(self) -> tuple[Float[np.ndarray, "n n_dof"], Float[np.ndarray, "n 4 4"]]:
@@ -307,10 +313,7 @@ class Rollout:
         stride = steps if self.stride is None else self.stride
         with quiet():
             for done in range(0, steps, max(1, stride)):
-                try:
-                    self.batch.step(rows[~self.overflowed[rows]].tolist(), nstep=min(stride, steps - done))
-                except mujoco.batch.SimulationError as error:  # more contacts than fit into memory; the others went on
-                    self.overflowed[error.ids] = True
+                self.batch.step(rows, min(stride, steps - done))
                 if self.stride is not None:
                     self.frames.append(self.poses())
 
@@ -342,14 +345,16 @@ def stands(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "
 
 
 def rollouts(
-    scene: TrialScene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
+    scene: TrialScene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None, device: str = "cpu"
 ) -> Iterator[tuple[GraspBatch, Rollout]]:
     """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
+    if len(grasps) < FEW and device != WARP:
+        device = "cpu"
     centre = torch.as_tensor(scene.obj.centre_of_mass)
-    for part in grasps.in_parts(CHUNK):
+    for part in grasps.in_parts(CHUNK if on_processor(device) else DEVICE_CHUNK):
         if scene.protocol.closing:
             part = complete(hand, part, centre, scene.protocol.controller)
-        yield part, Rollout(scene, part, workers or cores(), stride)
+        yield part, Rollout(scene, part, workers or cores(), stride, device=device)
 
 
 class _Quiet:

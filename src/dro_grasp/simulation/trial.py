@@ -25,12 +25,14 @@ from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, draw, rollouts
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
+from dro_grasp.simulation.worlds import on_processor
 
 
 @checked
 def simulate(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     workers: int | None = None, progress: Callable[[int, int], None] | None = None, another: bool = False,
+    device: str = "cpu", confirm: bool = True,
 ) -> TrialResult:
     """Evaluate grasps of one object in MuJoCo.
 
@@ -42,27 +44,44 @@ def simulate(
         workers: Threads; all cores by default. The result does not depend on it.
         progress: Called with (grasps evaluated, grasps in all).
         another: Take the object although the grasps were made for one of other name and content.
+        device: `cuda` runs many trials together by MuJoCo Warp (extra `gpu`), in single precision; few run on the processor.
+        confirm: Let the processor judge again what holds on a device; what fails there, fails.
 
     Raises:
         ObjectError: The object is a bare point cloud, or not that of the grasps.
         HandError: The hand came without its description.
         GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+        OptionError: The protocol does not exist, or the extra is missing.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     if not another:
         grasps.require_object(obj)
     results, done = [], 0
-    for part, rollout in rollouts(scene, hand, grasps, workers):
-        penetration = measure_penetration(scene, part)
-        result = run_trial(rollout, penetration)
-        if scene.protocol.perturbations.trials > 1:
-            result = _repeated(scene, part, result, penetration, workers)
+    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
+        result = _evaluated(part, rollout, workers)
+        if confirm and not on_processor(rollout.device):
+            result = _confirmed(scene, part, result, workers)
         results.append(result)
         done += len(part)
         if progress is not None:
             progress(done, len(grasps))
     return TrialResult.join(results, scene.protocol.label, grasps.asked)
+
+
+def _evaluated(part: GraspBatch, rollout: Rollout, workers: int | None) -> TrialResult:
+    """All trials of the grasps of a rollout."""
+    penetration = measure_penetration(rollout.scene, part)
+    result = run_trial(rollout, penetration)
+    return result if rollout.scene.protocol.perturbations.trials == 1 else _repeated(
+        rollout, part, result, penetration, workers)
+
+
+def _confirmed(scene: TrialScene, grasps: GraspBatch, result: TrialResult, workers: int | None) -> TrialResult:
+    """The outcome in which the processor has judged what holds."""
+    held, others = result.success.nonzero()[:, 0], (~result.success).nonzero()[:, 0]
+    again = [_evaluated(part, rollout, workers) for part, rollout in rollouts(scene, scene.hand, grasps[held], workers)]
+    joined = TrialResult.join([result.rows(others), *again], result.protocol)
+    return joined.rows(torch.cat([others, held]).argsort())
 
 
 def record(
@@ -102,10 +121,10 @@ def run_trial(rollout: Rollout, penetration: Penetration) -> TrialResult:
 
 
 def _repeated(
-    scene: TrialScene, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
+    rollout: Rollout, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
 ) -> TrialResult:
     """The outcome with all trials of a protocol that perturbs, from the first; who penetrates too deep fails them all."""
-    rules = scene.protocol.perturbations
+    scene, rules = rollout.scene, rollout.scene.protocol.perturbations
     deep = torch.tensor([failure in {Failure.PENETRATION, Failure.SELF_PENETRATION} for failure in first.failure])
     others, rows = deep.nonzero()[:, 0], (~deep).nonzero()[:, 0]
     results = [replace(first.rows(others), robustness=torch.zeros(len(others)))]
@@ -115,8 +134,9 @@ def _repeated(
             if begin == end:
                 continue
             index, own = rows.repeat(end - begin), conditions.rows(slice((begin - 1) * len(rows), (end - 1) * len(rows)))
-            rollout = Rollout(_scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own)
-            trials.append(run_trial(rollout, penetration.rows(index.numpy())))
+            other = Rollout(
+                _scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own, device=rollout.device)
+            trials.append(run_trial(other, penetration.rows(index.numpy())))
         results.append(verdict(TrialResult.join(trials, first.protocol), rules.trials, rules.needed))
     return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
 
@@ -129,7 +149,8 @@ def _scene_of_trial(scene: TrialScene, trial: int) -> TrialScene:
 
 
 def settle(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    workers: int | None = None, device: str = "cpu"
 ) -> GraspBatch:
     """The same grasps, relabelled with the poses of hand and object after closing.
 
@@ -140,7 +161,7 @@ def settle(
     """
     scene = scene_of(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
-    for part, rollout in rollouts(scene, hand, grasps, workers):
+    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
         held_joints, T_object_wrist = held(part, rollout, torch.from_numpy(rollout.close().stable))
         joints.append(held_joints)
         poses.append(T_object_wrist)

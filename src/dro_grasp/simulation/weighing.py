@@ -50,7 +50,7 @@ class WeighingConfig(Checked):
 
 def weigh(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None,
+    weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None, device: str = "cpu",
 ) -> Float[Tensor, " n"]:
     """Payloads of grasps that state one, weighed in simulation [kg].
 
@@ -64,14 +64,16 @@ def weigh(
         weight: How grasps squeeze for a mass.
         config: How they are weighed.
         workers: Threads; all cores by default.
+        device: As of `simulate`.
     """
     weight, config, found = weight or WeightConfig(), config or WeighingConfig(), grasps.payload.clone()
     rows = found.isfinite().nonzero()[:, 0]
     begin = 0
-    for part, rollout in rollouts(scene_of(hand, obj, grasps, protocol), hand, grasps[rows], workers):
+    for part, rollout in rollouts(
+            scene_of(hand, obj, grasps, protocol), hand, grasps[rows], workers, device=device):
         rollout.close()
         joints = torch.from_numpy(rollout.poses()[0]).to(part.joints)
-        chosen = squeezes_of(hand, contact_forces(rollout), joints, part.squeeze_joints, weight)
+        chosen = squeezes_of(hand, contact_forces(rollout), joints, part.squeeze_joints, weight, rollout.place)
         made_for = torch.from_numpy(rollout.mass).to(joints)
         found[rows[begin:begin + len(part)]] = weighed(rollout, chosen, part.payload, weight, config, made_for)
         begin += len(part)
@@ -116,7 +118,8 @@ def weighed(
     low, high, tried = np.full(len(at), -np.inf), np.full(len(at), np.inf), _Tried.nothing(len(at))
     for _ in range(config.rounds):
         mass = np.exp(at)
-        targets = chosen.targets((torch.from_numpy(mass).to(guess) - made_for)[:, None])[:, 0].numpy()
+        added = (torch.from_numpy(mass).to(guess) - made_for).to(chosen.joints)
+        targets = chosen.targets(added[:, None])[:, 0].cpu().numpy()
         rollout.make_heavy(mass)  # a light object would move at once where a heavy one has hardly begun to
         rollout.go_back(closed)
         rollout.press(targets[:, rollout.scene.actuated], config.pressing)

@@ -210,7 +210,7 @@ class KinematicTree:
 
     def point_jacobian(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"], points: Float[Tensor, "*batch n_points 3"],
-        links: Int[Tensor, " n_points"],
+        links: Int[Tensor, "*#batch n_points"],
     ) -> Float[Tensor, "*batch n_points 3 n_dof"]:
         """Derivative of world points [m], each fixed to a link, by the independent joints.
 
@@ -221,7 +221,7 @@ class KinematicTree:
             angular[..., None, :, :].expand(*points.shape[:-1], -1, -1), points[..., :, None, :].expand(
                 *points.shape[:-1], self.n_links, 3), dim=-1
         )
-        velocity = velocity * self.descends[links][:, :, None].to(points.dtype)
+        velocity = velocity * self.descends[links][..., None].to(points.dtype)
         return torch.einsum("...plx,ld->...pxd", velocity, self.link_coupling)
 
 

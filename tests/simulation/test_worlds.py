@@ -1,0 +1,260 @@
+"""Worlds on a device: what goes there and comes back, with MuJoCo in Warp's place; and Warp itself on the processor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco.batch
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp import extras
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import TABLE
+from dro_grasp.grasps.controller import complete
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation import rollout as rollout_module, warp_worlds
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
+from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.payload import PayloadConfig, given_way, payloads
+from dro_grasp.simulation.pressure import contact_forces
+from dro_grasp.simulation.protocols import CARRY, Perturbations, Protocol, protocol
+from dro_grasp.simulation.rollout import Rollout
+from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.simulation.warp_worlds import Room
+from dro_grasp.simulation.worlds import STATE, WARP
+from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+
+State = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    return claw(tmp_path_factory.mktemp("hand"))
+
+
+@pytest.fixture(scope="module")
+def obj() -> ObjectModel:
+    return ball()
+
+
+@pytest.fixture(scope="module")
+def grasps(hand: Hand, obj: ObjectModel) -> GraspBatch:
+    """Grasps that hold, and one that does not."""
+    made = GraspBatch.concatenate([
+        power_grasp(hand, obj, 3), grasps_of(hand, obj, wrist_below(0.3), torch.tensor([[0.0, 0.6] * 4]))])
+    return complete(hand, made, torch.as_tensor(obj.centre_of_mass))
+
+
+class Steps:
+    """MuJoCo where Warp's graphs would be, with whatever is done to the outcome of a call."""
+
+    def __init__(self, change: Callable[[State, np.ndarray], None] = lambda state, missed: None) -> None:
+        self.change, self.calls = change, list[int]()
+
+    def __call__(self, scene: TrialScene, device: str, fields: tuple[str, ...]) -> Steps:
+        self.scene, self.fields = scene, fields
+        return self
+
+    def step(self, inputs: State, fields: State, count: int) -> tuple[State, np.ndarray]:
+        number = len(inputs["qpos"])
+        self.calls.append(number)
+        batch, missed = mujoco.batch.Batch(self.scene.model, nsim=number, nthread=1), np.zeros(number, bool)
+        for name, values in inputs.items():
+            batch.bind(name)[:] = values
+        for name, values in fields.items():
+            batch.expand(name)[:] = values
+        batch.step(nstep=count)
+        state = {name: np.array(batch.bind(name)) for name in STATE}
+        self.change(state, missed)
+        return state, missed
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Steps]:
+    pytest.importorskip("mujoco_warp")
+
+    def install(*change: Callable[[State, np.ndarray], None]) -> Steps:
+        made = Steps(*change)
+        monkeypatch.setattr(warp_worlds, "_graphs", made)
+        monkeypatch.setattr(rollout_module, "FEW", 0)
+        return made
+
+    return install
+
+
+def same(a: TrialResult, b: TrialResult) -> None:
+    for name in ("success", "displacement", "rotation", "closing_shift", "closing_rotation", "robustness"):
+        x, y = getattr(a, name).float(), getattr(b, name).float()
+        assert torch.equal(x.nan_to_num(-1.0), y.nan_to_num(-1.0)), name
+    assert a.failure == b.failure
+
+
+ROBUST = replace(protocol("robust"), perturbations=Perturbations(
+    trials=4, needed=2, shift=0.003, friction=(0.5, 2.0), mass=(0.5, 2.0), gain=(0.5, 2.0)))
+
+
+@pytest.mark.parametrize("rules", [protocol("strict"), CARRY, protocol("dexgraspbench"), ROBUST], ids=lambda rules: rules.name)
+def test_trials_see_the_same_state_forces_masses_friction_and_gains_on_a_device(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps], rules: Protocol
+) -> None:
+    made = steps()
+    found = simulate(hand, obj, grasps, rules, device="cuda", confirm=False)
+    same(found, simulate(hand, obj, grasps, rules))
+    assert made.calls
+    assert rules is not ROBUST or {"geom_friction", "body_mass", "actuator_gainprm"} <= set(made.fields)
+
+
+def test_a_table_is_there_on_a_device(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    steps()
+    assert obj.vertices is not None
+    plane = torch.tensor([[0.0, 0.0, 1.0, float(obj.vertices[:, 2].min())]])
+    laid = grasps.replace(extra={**grasps.extra, TABLE: plane.repeat(len(grasps), 1)})
+    found = simulate(hand, obj, laid, device="cuda", confirm=False)
+    same(found, simulate(hand, obj, laid))
+    assert not torch.equal(found.closing_shift, simulate(hand, obj, grasps).closing_shift)
+
+
+def test_settling_and_the_state_of_grasps_are_the_same_on_a_device(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    steps()
+    assert torch.equal(settle(hand, obj, grasps, device="cuda").joints, settle(hand, obj, grasps).joints)
+    config = WeightConfig(max_force=4.0)
+    a, b = (grasp_state(hand, obj, grasps, config=config, device=device)[0] for device in (WARP, "cpu"))
+    assert torch.equal(a.gave, b.gave)
+    assert bool(a.gave.isfinite().all())
+    assert torch.equal(a.unanswered, b.unanswered)
+
+
+def test_worlds_without_room_run_on_the_processor_and_the_others_stay_what_they_are(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    def nonsense(state: State, missed: np.ndarray) -> None:
+        missed[::2] = True
+        state["qpos"][missed] += 1.0
+
+    steps(nonsense)
+    same(simulate(hand, obj, grasps, CARRY, device="cuda", confirm=False), simulate(hand, obj, grasps, CARRY))
+
+
+def test_rows_that_do_not_step_stay_as_they_are_and_what_exploded_steps_no_more(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    def explode(state: State, missed: np.ndarray) -> None:
+        state["qvel"][1] = np.nan if len(made.calls) == 1 else state["qvel"][1]
+
+    made = steps(explode)
+    rollout = Rollout(cached_scene(hand, obj, CARRY), grasps, 1, device="cuda")
+    before = rollout.moment()
+    rollout.pull(np.array([0, 2]), np.ones((2, 3)), 0.05)
+    assert rollout.batch.unsound.tolist() == [False, False, True, False]
+    after = rollout.moment()
+    for name in STATE:
+        np.testing.assert_array_equal(after[name][[1, 3]], before[name][[1, 3]])
+        assert (after[name][0] != before[name][0]).any()
+    closed = rollout.close()
+    assert closed.stable.tolist() == [True, True, False, True]
+    assert set(made.calls[1:]) == {3}
+
+
+def test_the_processor_judges_what_holds_on_a_device(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
+) -> None:
+    steps(lambda state, missed: None)
+    expected, start = simulate(hand, obj, grasps, CARRY), Rollout(cached_scene(hand, obj, CARRY), grasps, 1)
+
+    def stand_still(state: State, missed: np.ndarray) -> None:
+        state["qpos"][:], state["qvel"][:], state["qacc_warmstart"][:] = start.qpos[:len(state["qpos"])], 0.0, 0.0
+
+    steps(stand_still)
+    assert simulate(hand, obj, grasps, CARRY, device="cuda", confirm=False).success.sum() > expected.success.sum()
+    confirmed = simulate(hand, obj, grasps, CARRY, device="cuda")
+    assert torch.equal(confirmed.success, expected.success)
+    rows = expected.success.nonzero()[:, 0]
+    same(confirmed.rows(rows), expected.rows(rows))
+
+
+def test_room_grows_for_contacts_at_once_and_for_constraints_where_many_worlds_lack_it() -> None:
+    kinds = pytest.importorskip("mujoco_warp").OverflowType
+    few, none = np.zeros(1000, int), np.zeros(1000, int)
+    few[:5] = kinds.NEFC
+    assert warp_worlds._larger(Room(), none) == warp_worlds._larger(Room(), few) == Room()
+    few[:50] = kinds.NEFC
+    assert warp_worlds._larger(Room(), few) == Room(rows=2 * Room().rows)
+    assert warp_worlds._larger(Room(), none + kinds.NARROWPHASE) == Room(contacts=2 * Room().contacts)
+    large = Room(warp_worlds.LARGEST_ROOM, warp_worlds.LARGEST_ROOM)
+    assert warp_worlds._larger(large, none + kinds.CCD) == large
+
+
+def test_a_device_without_the_extra_says_what_to_install(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate(hand, obj, grasps, device="cuda")  # they are few
+    monkeypatch.setattr(rollout_module, "FEW", 0)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "mujoco_warp" else object())
+    warp_worlds._modules.cache_clear()
+    with pytest.raises(OptionError, match=r"mujoco_warp.*dro-grasp\[gpu\]"):
+        simulate(hand, obj, grasps, device="cuda")
+
+
+def test_payloads_and_answers_are_the_same_on_a_device(hand: Hand, obj: ObjectModel, grasps: GraspBatch, device: str) -> None:
+    rollout = Rollout(cached_scene(hand, obj, CARRY), grasps, 1)
+    rollout.close()
+    contacts, joints = contact_forces(rollout), torch.from_numpy(rollout.poses()[0]).float()
+    mass = torch.as_tensor(rollout.mass).float()
+    found = []
+    for place in ("cpu", device):
+        chosen = squeezes_of(hand, contacts, joints, grasps.squeeze_joints, WeightConfig(), place)
+        still = chosen.joints.new_zeros(len(grasps))
+        targets = chosen.targets(mass.to(place)[:, None])
+        moved, turned = given_way(chosen, still.new_tensor([0.01, 0.1]), PayloadConfig())
+        answers = unanswered(contacts, mass.to(place), 0.2)
+        found.append([x.cpu() for x in (payloads(chosen, still, still), targets, moved, turned, answers)])
+    assert all(float(x.abs().max()) > 0 for x in found[0][1:])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rules", [protocol("strict"), CARRY, ROBUST], ids=lambda rules: rules.name)
+def test_warp_judges_grasps_of_a_hand_as_mujoco_does(rules: Protocol) -> None:
+    """On the processor, where kernels compile for minutes the first time."""
+    pytest.importorskip("mujoco_warp")
+    hand, obj = load_hand("gripper3"), load_object("cube")
+    grasps = settle(hand, obj, _around(hand, obj))
+    expected = simulate(hand, obj, grasps, rules)
+    found = simulate(hand, obj, grasps, rules, device=WARP, confirm=False)
+    assert 0 < int(expected.success.sum()) < len(grasps)
+    assert torch.equal(found.success, expected.success)
+    held = expected.success
+    torch.testing.assert_close(found.closing_shift[held], expected.closing_shift[held], rtol=0.05, atol=2e-4)
+
+
+def _around(hand: Hand, obj: ObjectModel) -> GraspBatch:
+    """A few grasps that the optimiser makes, and the first of them too far away to hold."""
+    from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
+
+    made = synthesize(hand, obj, 4, 0, SynthesisConfig(steps=60))
+    away = made.T_object_wrist[:1].clone()
+    away[:, :3, 3] *= 3
+    return GraspBatch.concatenate([made, made[:1].replace(T_object_wrist=away)])
+
+
+@pytest.mark.gpu
+def test_a_gpu_judges_as_the_processor_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout_module, "FEW", 0)
+    hand, obj = load_hand("gripper3"), load_object("cube")
+    grasps = settle(hand, obj, _around(hand, obj))
+    found = simulate(hand, obj, grasps, "strict", device="cuda", confirm=False)
+    assert torch.equal(found.success, simulate(hand, obj, grasps, "strict").success)
+    pressed(hand, obj, grasps, device="cuda")
