@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry.se3 import apply_to_cloud, register
@@ -23,7 +23,7 @@ class MultilaterationConfig(Checked):
     max_step: float = 0.05  # longest Gauss-Newton step [m]
     approach_anchors: int = 128
     """All steps but the last two use about so many anchors, evenly from the list: they only approach the minimum."""
-    chunk: int = 4  # clouds that are refined at once: more do not fit into the processor's cache
+    chunk: int = 4  # clouds that a CPU refines at once: more do not fit into its cache; other devices take all
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,8 @@ def _refine_where(
     rows = chosen.reshape(-1).nonzero()[:, 0]
     start, distances = start.reshape(-1, n, 3), distances.reshape(-1, n, m)
     anchors = cloud.points.reshape(-1, m, 3)
-    parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(config.chunk)]
+    chunk = config.chunk if rows.device.type == "cpu" else len(rows)
+    parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(chunk)]
     return start.index_put((rows,), torch.cat(parts)).reshape(shape)
 
 
@@ -178,8 +179,8 @@ class SideConfig(Checked):
 
 @torch.no_grad()
 def choose_sides(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], reference: int, config: SideConfig | None = None,
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    misfit: Float[Tensor, "b 2 l p"], reference: int | Int[Tensor, " b"], config: SideConfig | None = None,
 ) -> Bool[Tensor, "b l p"]:
     """Whether each point takes its second candidate.
 
@@ -188,8 +189,8 @@ def choose_sides(
     the other, and the two ways in which the plane may cut it. From each start, points pick their nearer candidates and the body
     is registered again; the smallest error wins, on the `reference` body's side if both sides fit alike.
 
-    Points of l bodies are in their own frames [m], with weight 0 for padding; misfits at their candidates [m^2] are mean
-    squares.
+    Points of l bodies, the same for all clouds or of each, are in their own frames [m], with weight 0 for padding; misfits at
+    their candidates [m^2] are mean squares.
     """
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)
@@ -197,23 +198,24 @@ def choose_sides(
     results = [_settle(local, weight, candidates, misfit, start, config) for start in starts]
     picks, errors = torch.stack([r[0] for r in results], 1), torch.stack([r[1] for r in results], 1)
     mostly_second = (picks * weight).sum(-1) > 0.5 * weight.sum(-1)
-    best = errors[..., reference].argmin(1)
-    side = mostly_second[..., reference].gather(1, best[:, None])
+    reference = torch.as_tensor(reference, device=errors.device).expand(len(errors))[:, None, None].expand(-1, len(starts), 1)
+    best = errors.gather(2, reference)[..., 0].argmin(1)
+    side = mostly_second.gather(2, reference)[..., 0].gather(1, best[:, None])
     agrees = mostly_second == side[..., None]
     best = torch.where(agrees, errors * config.reference_margin, errors).argmin(1)
     return picks.gather(1, best[:, None, :, None].expand(-1, 1, -1, picks.shape[-1]))[:, 0]
 
 
 def _cut(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], height: Float[Tensor, "b l p"], config: SideConfig
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], height: Float[Tensor, "b l p"], config: SideConfig
 ) -> Bool[Tensor, "b l p"]:
     """Side of the plane for each point of each body, up to exchanging the sides."""
     # A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So h^2 = (x,
     # 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives them, and a is
     # the leading eigenvector.
-    count = weight.sum(-1)[:, None, None]
-    centred = local - (local * weight[..., None]).sum(1, keepdim=True) / count
-    size = ((centred.square() * weight[..., None]).sum((1, 2), keepdim=True) / count).sqrt().clamp(min=1e-6)
+    count = weight.sum(-1)[..., None, None]
+    centred = local - (local * weight[..., None]).sum(-2, keepdim=True) / count
+    size = ((centred.square() * weight[..., None]).sum((-2, -1), keepdim=True) / count).sqrt().clamp(min=1e-6)
     x = torch.cat([centred / size, torch.ones_like(local[..., :1])], -1)
     rows, columns = torch.triu_indices(4, 4, device=local.device)
     products = x[..., rows] * x[..., columns] * (2 - (rows == columns).to(x)) * weight[..., None]
@@ -228,7 +230,7 @@ def _cut(
 
 
 def _settle(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], candidates: Float[Tensor, "b 2 l p 3"],
     misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b l p"], config: SideConfig,
 ) -> tuple[Bool[Tensor, "b l p"], Float[Tensor, "b l"]]:
     """Alternate between picking and registering; returns the picks and each body's mean squared error [m^2]."""

@@ -218,8 +218,8 @@ class Neighbours(torch.autograd.Function):
         ctx: Any, values: Float[Tensor, "b n d"], sign: Float[Tensor, " d"], index: Int[Tensor, "b n k"],
         adjacency: Float[Tensor, "b n n"] | None,
     ) -> tuple[Float[Tensor, "b n d"], Float[Tensor, "b n d"]]:
-        """`adjacency` counts each edge once; without it, the sum has no gradient."""
-        values, index = values.contiguous(), index.to(torch.int32).contiguous()
+        """The index has 32 bits. `adjacency` has 1 for each edge; without it, the sum has no gradient."""
+        values, ctx.mixed = values.contiguous(), torch.is_autocast_enabled(values.device.type)
         b, n, width = values.shape
         highest, total = torch.empty_like(values), torch.empty_like(values)
         source = torch.empty(values.shape, dtype=torch.int16, device=values.device)
@@ -239,9 +239,20 @@ class Neighbours(torch.autograd.Function):
     ) -> tuple[Float[Tensor, "b n d"] | None, ...]:
         source, adjacency = ctx.saved_tensors
         of_highest, of_total = grad_outputs
-        out = torch.zeros_like(of_highest) if adjacency is None else adjacency.mT @ of_total
+        with torch.autocast(source.device.type, torch.bfloat16, enabled=ctx.mixed):
+            out = torch.zeros_like(of_highest) if adjacency is None else (adjacency.mT @ of_total).float()
         _, n, width = source.shape
         block = 1024
         _neighbours_backward[(triton.cdiv(source.numel(), block),)](
             of_highest.contiguous(), source, out, n, width, source.numel(), BLOCK=block)
         return out, None, None, None
+
+
+def try_out() -> None:
+    """Run both kernels once on a few values, which also shows whether they compile here."""
+    device = torch.device("cuda", torch.cuda.current_device())
+    sides, weight = torch.ones(2, 1, 4, 4, device=device), torch.ones(4, 4, device=device)
+    pairs = PairLayers.apply(sides, sides, weight, weight[0], weight[0], False)
+    highest, _ = Neighbours.apply(sides[0], weight[0], torch.zeros(1, 4, 1, dtype=torch.int32, device=device), None)
+    if not bool((pairs == 36).all() & (highest == 1).all()):  # type: ignore[operator]
+        raise RuntimeError("a kernel is wrong here")

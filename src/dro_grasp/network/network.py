@@ -113,7 +113,7 @@ class DistanceNetwork(nn.Module):
         super().__init__()
         self.config, self.name = config, name
         self.mixed = False
-        """Whether encoders and transformers multiply in bfloat16; distances are always computed in single precision."""
+        """Whether encoders and transformers multiply in bfloat16, and the kernel of distances in TF32, where a GPU does."""
         c = config
         self.hand_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
@@ -224,7 +224,7 @@ class DistanceNetwork(nn.Module):
     ) -> Float[Tensor, "b n m"]:
         base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
         with_z = (torch.cat([psi, z[:, None].expand(-1, psi.shape[1], -1)], -1) for psi in (psi_hand, psi_object))
-        return self.head(*with_z, base)
+        return self.head(*with_z, base, self.mixed)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]
