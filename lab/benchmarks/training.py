@@ -1,8 +1,8 @@
 """Samples that training takes a second, by preset and batch, and where a step's time goes.
 
-Hands are built in; objects are ellipsoids, one of them as flat as a phone, and grasps are made up: speed depends on sizes alone,
-and nothing else than the packages for training is needed. Steps are those of `train`, timed by its log once they are warm; a
-GPU multiplies in bfloat16, as `--mixed` has it. `--against` runs the same with the package of another folder, in turn.
+Hands are built in; objects are ellipsoids, one of them as flat as a phone, and grasps are made up: speed depends on sizes
+alone. Steps are those of `train`, timed by its log once they are warm; a GPU multiplies in bfloat16, as `--mixed` has it.
+`--against` runs the same with the package of another folder first.
 
     python -m lab.benchmarks.training [--device cuda] [--quick] [--profile] [--exact] [--against FOLDER/src] [--json]
 """
@@ -47,7 +47,7 @@ QUICK = {"multi": (2048,), "paper": (384,)}
 """The same with `--quick` on a GPU."""
 STEPS, WARM_UP = 9, 4
 """Steps, and those that are not counted."""
-SHOWN = 20
+SHOWN = 30
 """Lines of a profile."""
 
 
@@ -118,9 +118,9 @@ def speeds(options: argparse.Namespace) -> dict[str, float]:
                     print(f"{preset}, {samples}: {str(error)[:80]}", file=sys.stderr)
                     continue
                 found[f"{preset} {samples}"] = samples / seconds
+                memory = torch.cuda.max_memory_allocated() / 2**30 if torch.cuda.is_initialized() else 0.0
                 print(f"{options.label}{preset}, {samples} a step: {samples / seconds:.0f} samples/s, {1e3 * seconds:.0f} ms a "
-                      f"step, {torch.cuda.max_memory_allocated() / 2**30 if options.device != 'cpu' else 0:.1f} GiB\n{profiled}",
-                      file=sys.stderr, flush=True)
+                      f"step, {memory:.1f} GiB\n{profiled}", file=sys.stderr, flush=True)
     return found
 
 

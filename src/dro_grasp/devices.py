@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, cached_property
-from types import ModuleType
 from typing import Any, TypeVar
 
 import torch
@@ -120,24 +118,6 @@ def quick_path_is_accurate() -> bool:
         product = a @ b
     exact = a.double() @ b.double()
     return bool((product - exact).abs().max() <= 1e-5 * exact.abs().max())  # (ours); single precision deviates by 4e-7
-
-
-def fused_kernels(values: Tensor) -> Any:
-    """The module `network.fused` for single-precision tensors on a CUDA device, if Triton runs there; else None."""
-    return _fused() if values.device.type == "cuda" and values.dtype == torch.float32 else None
-
-
-@cache
-def _fused() -> ModuleType | None:
-    try:
-        from dro_grasp.network import fused
-
-        fused.try_out()
-    except Exception as error:  # there may be no Triton, no compiler for it, or a card that it does not know
-        print(f"Triton is of no use here ({type(error).__name__}: {str(error)[:200]}); a GPU then trains several times slower",
-              file=sys.stderr)
-        return None
-    return fused
 
 
 def on_device(record: Record, device: torch.device | str) -> Record:

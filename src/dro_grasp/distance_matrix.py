@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.devices import Rows, on_device
@@ -142,7 +142,7 @@ def together(segments: Sequence[Segments]) -> Segments:
 
 def _segments(
     hand: Hand, links: Int[Tensor, " own"], rows: list[Int[Tensor, " _"]], n_links: int, n_points: int
-) -> tuple[Tensor, ...]:
+) -> tuple[Shaped[Tensor, "..."], ...]:
     """The fields of a hand's row of `Segments`, on the CPU."""
     own, filled = torch.arange(n_links) < len(rows), rows + rows[:1] * (n_links - len(rows))
     links = torch.cat([links, links[:1].expand(n_links - len(links))])
@@ -162,8 +162,8 @@ def _take(values: Float[Tensor, "b n *rest"], index: Int[Tensor, "b k"]) -> Floa
 
 
 def _sides(
-    segments: Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"], object_points: Float[Tensor, "b m 3"],
-    config: DecodeConfig,
+    segments: Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
+    object_points: Float[Tensor, "b m 3"], config: DecodeConfig,
 ) -> Bool[Tensor, "b n"]:
     """Whether each hand point takes its second candidate, for grasps of flat objects."""
     candidates = torch.stack([segments.of_points(both[:, side]) for side in (0, 1)], 1)

@@ -21,7 +21,6 @@ from dro_grasp.training.losses import (
     pose_loss,
 )
 
-
 ALL = torch.tensor([True])
 
 

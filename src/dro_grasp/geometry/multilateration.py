@@ -197,6 +197,7 @@ def choose_sides(
     starts = (torch.zeros_like(cut), torch.ones_like(cut), cut, ~cut)
     results = [_settle(local, weight, candidates, misfit, start, config) for start in starts]
     picks, errors = torch.stack([r[0] for r in results], 1), torch.stack([r[1] for r in results], 1)
+    weight = weight.expand(len(candidates), -1, -1)[:, None]
     mostly_second = (picks * weight).sum(-1) > 0.5 * weight.sum(-1)
     reference = torch.as_tensor(reference, device=errors.device).expand(len(errors))[:, None, None].expand(-1, len(starts), 1)
     best = errors.gather(2, reference)[..., 0].argmin(1)

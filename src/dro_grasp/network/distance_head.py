@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from dro_grasp.devices import fused_kernels
+from dro_grasp.network.kernels import fused_kernels
 
 threshold_backward = torch.ops.aten.threshold_backward
 PAIRS_PER_CHUNK = {"cpu": 2048, "cuda": 1 << 19}

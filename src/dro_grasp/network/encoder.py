@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dro_grasp.devices import fused_kernels
+from dro_grasp.network.kernels import fused_kernels
 
 SLOPE = 0.2  # Negative slope of LeakyReLU. Source: appendix
 
@@ -76,7 +76,7 @@ class EdgeLayer(nn.Module):
     def _highest(
         self, neighbour: Float[Tensor, "b n d"], graph: Graph
     ) -> tuple[Float[Tensor, "b n d"], Float[Tensor, "b n d"] | None]:
-        """The value, among each point's neighbours, that a scale of either sign makes the highest; the sum, if it is at hand."""
+        """The value of each point's neighbours that a scale of either sign makes the highest; their sum, if it is at hand."""
         sign = torch.where(self.norm.weight < 0, -1.0, 1.0).to(neighbour.dtype)
         if fused := fused_kernels(neighbour):
             adjacency = graph.adjacency if self.norm.training and neighbour.requires_grad else None

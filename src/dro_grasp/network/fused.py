@@ -15,38 +15,56 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-BITS = tl.constexpr(32)  # Signs in a word
-ROWS, COLUMNS = 8, 16  # Hand points and object points of a tile of pairs. Source: ours, timed
-HIDDEN = 64  # Units of the first hidden layer that are multiplied at a time. Source: ours, timed
-POINTS, CHANNELS = 32, 32  # Points and channels of a tile of neighbours. Source: ours, timed
-EXACT, ROUNDED = "tf32x3", "tf32"
-"""Products that are as exact as single precision, in three parts, and those whose factors have 10 bits."""
-WARPS = 8  # Warps of a program on pairs. Source: ours, timed
-PROGRAMS = 512  # Programs that keep a large card busy: small batches are split until there are so many. Source: ours
-
-
-@triton.jit
-def _tile(start_i, start_j, n, m, ROWS: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Hand point and object point of each pair of a tile, and whether it is one."""
-    pair = tl.arange(0, ROWS * COLUMNS)
-    i, j = start_i + pair // COLUMNS, start_j + pair % COLUMNS
-    return i, j, (i < n) & (j < m)
-
-
-@triton.jit
-def _first(hand, obj, i, j, h, side, n, m, width, inside):  # type: ignore[no-untyped-def]
-    """The first hidden layer before its threshold, for pairs and some units; -1 outside."""
-    mask = inside[:, None] & (h < width)[None, :]
-    x = tl.load(hand + (side * n + i)[:, None] * width + h[None, :], mask=mask, other=-1.0)
-    return x + tl.load(obj + (side * m + j)[:, None] * width + h[None, :], mask=mask, other=0.0)
+BITS = tl.constexpr(32)
+"""Signs in a word."""
+ROWS = 8
+"""Hand points of a tile of pairs. Source: ours, timed."""
+COLUMNS = 16
+"""Object points of a tile of pairs. Source: ours, timed."""
+HIDDEN = 64
+"""Units of the first hidden layer that are multiplied at a time. Source: ours, timed."""
+WARPS = 8
+"""Warps of a program on pairs. Source: ours, timed."""
+COUNTED = 64
+"""Pairs whose signs are counted at a time. Source: ours."""
+POINTS = 32
+"""Points of a tile of neighbours. Source: ours, timed."""
+CHANNELS = 32
+"""Channels of a tile of neighbours. Source: ours, timed."""
+SCATTERED = 1024
+"""Gradients that a program adds to neighbours. Source: ours."""
+PROGRAMS = 512
+"""Programs that keep a large card busy: small batches are split until there are so many. Source: ours."""
+EXACT = "tf32x3"
+"""Products as exact as single precision, in three parts."""
+ROUNDED = "bf16"
+"""Products of factors with 8 bits, summed in single precision."""
 
 
 @triton.jit
 def _product(a, b, total, PRECISION: tl.constexpr):  # type: ignore[no-untyped-def]
-    """total + a b."""
+    """The sum of total and a b."""
     if PRECISION == "bf16":
-        return tl.dot(a.to(tl.bfloat16), b.to(tl.bfloat16), total)
-    return tl.dot(a, b, total, input_precision=PRECISION)
+        result = tl.dot(a.to(tl.bfloat16), b.to(tl.bfloat16), total)
+    else:
+        result = tl.dot(a, b, total, input_precision=PRECISION)
+    return result
+
+
+@triton.jit
+def _first(hand, obj, i, j, h, side, n, m, width):  # type: ignore[no-untyped-def]
+    """The first hidden layer before its threshold: hand points i with object points j, one row a pair."""
+    known = (h < width)[None, :]
+    a = tl.load(hand + (side * n + i)[:, None] * width + h[None, :], mask=(i < n)[:, None] & known, other=0.0)
+    b = tl.load(obj + (side * m + j)[:, None] * width + h[None, :], mask=(j < m)[:, None] & known, other=0.0)
+    return tl.reshape(a[:, None, :] + b[None, :, :], [i.shape[0] * j.shape[0], h.shape[0]])
+
+
+@triton.jit
+def _places(i, j, n, m):  # type: ignore[no-untyped-def]
+    """Place of each pair in a sample, and whether there is one."""
+    place, inside = i[:, None] * m + j[None, :], (i < n)[:, None] & (j < m)[None, :]
+    return tl.reshape(place, [i.shape[0] * j.shape[0]]), tl.reshape(inside, [i.shape[0] * j.shape[0]])
 
 
 @triton.jit
@@ -57,7 +75,9 @@ def _pairs_forward(  # type: ignore[no-untyped-def]
 ):
     """One tile of pairs: both orders through both layers; keeps which units of the second layer are above zero."""
     sample, across = tl.program_id(1).to(tl.int64), tl.cdiv(m, COLUMNS)
-    i, j, inside = _tile(tl.program_id(0) // across * ROWS, tl.program_id(0) % across * COLUMNS, n, m, ROWS, COLUMNS)
+    i = tl.program_id(0) // across * ROWS + tl.arange(0, ROWS)
+    j = tl.program_id(0) % across * COLUMNS + tl.arange(0, COLUMNS)
+    place, inside = _places(i, j, n, m)
     k = tl.arange(0, OUTPUTS)
     from_last = tl.load(last + k, mask=k < outputs, other=0.0)
     total = tl.zeros([ROWS * COLUMNS], tl.float32)
@@ -66,7 +86,7 @@ def _pairs_forward(  # type: ignore[no-untyped-def]
         y = tl.zeros([ROWS * COLUMNS, OUTPUTS], tl.float32)
         for start in range(0, width, HIDDEN):
             h = start + tl.arange(0, HIDDEN)
-            x = tl.maximum(_first(hand, obj, i, j, h, side, n, m, width, inside), 0.0)
+            x = tl.maximum(_first(hand, obj, i, j, h, side, n, m, width), 0.0)
             w = tl.load(weight + k[None, :] * width + h[:, None], mask=(k < outputs)[None, :] & (h < width)[:, None], other=0.0)
             y = _product(x, w, y, PRECISION)
         y += tl.load(bias + k, mask=k < outputs, other=0.0)[None, :]
@@ -75,62 +95,81 @@ def _pairs_forward(  # type: ignore[no-untyped-def]
             lane, word = tl.arange(0, BITS), tl.arange(0, OUTPUTS // BITS)
             above = tl.reshape((y > 0).to(tl.int32), [ROWS * COLUMNS, OUTPUTS // BITS, BITS])
             words = tl.sum(above << lane[None, None, :], 2)
-            place = ((side * n + i) * m + j)[:, None] * (OUTPUTS // BITS) + word[None, :]
-            tl.store(signs + place, words, mask=inside[:, None] & (word >= 0)[None, :])
-    tl.store(out + (sample * n + i) * m + j, 0.5 * total, mask=inside)
+            to = (side * n * m + place)[:, None] * (OUTPUTS // BITS) + word[None, :]
+            tl.store(signs + to, words, mask=inside[:, None] & (word >= 0)[None, :])
+    tl.store(out + sample * n * m + place, 0.5 * total, mask=inside)
+
+
+@triton.jit
+def _above(signs, first, place, inside, OUTPUTS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """1 where a unit of the second layer is above zero, for pairs, else 0."""
+    lane, word = tl.arange(0, BITS), tl.arange(0, OUTPUTS // BITS)
+    where = (first + place)[:, None] * (OUTPUTS // BITS) + word[None, :]
+    words = tl.load(signs + where, mask=inside[:, None] & (word >= 0)[None, :], other=0)
+    return tl.reshape(((words[:, :, None] >> lane[None, None, :]) & 1).to(tl.float32), [place.shape[0], OUTPUTS])
 
 
 @triton.jit
 def _pairs_backward(  # type: ignore[no-untyped-def]
-    hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, counts, batch, n: tl.constexpr, m: tl.constexpr,
+    hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, batch, n: tl.constexpr, m: tl.constexpr,
     width: tl.constexpr, outputs: tl.constexpr, steps: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
     HIDDEN: tl.constexpr, OUTPUTS: tl.constexpr, PRECISION: tl.constexpr,
 ):
     """Some units of the first layer, for some object points of a sample and all hand points.
 
     With s = 1 where a unit of the second layer is above zero, the gradient of a pair by the first layer is g (s * last) W. The
-    gradients of weights follow from the sums over pairs of g s^T x (`shares`) and g s (`counts`).
+    gradients of weights follow from the sums over pairs of g s^T x (`shares`) and g s (`_pairs_counts`).
     """
     sample, part = tl.program_id(2).to(tl.int64), tl.program_id(1)
     h, k = tl.program_id(0) * HIDDEN + tl.arange(0, HIDDEN), tl.arange(0, OUTPUTS)
     known = (k < outputs)[:, None] & (h < width)[None, :]
     w = tl.load(weight + k[:, None] * width + h[None, :], mask=known, other=0.0)
     w = w * tl.load(last + k, mask=k < outputs, other=0.0)[:, None]
-    share, count = tl.zeros([OUTPUTS, HIDDEN], tl.float32), tl.zeros([OUTPUTS], tl.float32)
+    share = tl.zeros([OUTPUTS, HIDDEN], tl.float32)
     for order in range(2):
         side = order * batch + sample
         for step in range(steps):
-            start_j = (part * steps + step) * COLUMNS
+            j = (part * steps + step) * COLUMNS + tl.arange(0, COLUMNS)
             to_obj = tl.zeros([COLUMNS, HIDDEN], tl.float32)
-            for start_i in range(0, n, ROWS):
-                i, j, inside = _tile(start_i, start_j, n, m, ROWS, COLUMNS)
-                x = _first(hand, obj, i, j, h, side, n, m, width, inside)
-                g = 0.5 * tl.load(grad + (sample * n + i) * m + j, mask=inside, other=0.0)
-                place = ((side * n + i) * m + j)[:, None] * (OUTPUTS // BITS) + (k // BITS)[None, :]
-                words = tl.load(signs + place, mask=inside[:, None] & (k >= 0)[None, :], other=0)
-                s = ((words >> (k % BITS)[None, :]) & 1).to(tl.float32)
+            for start in range(0, n, ROWS):
+                i = start + tl.arange(0, ROWS)
+                place, inside = _places(i, j, n, m)
+                x = _first(hand, obj, i, j, h, side, n, m, width)
+                g = 0.5 * tl.load(grad + sample * n * m + place, mask=inside, other=0.0)
+                s = _above(signs, side * n * m, place, inside, OUTPUTS)
                 share = _product(tl.trans(s), g[:, None] * tl.maximum(x, 0.0), share, PRECISION)
-                count += tl.sum(g[:, None] * s, 0)
                 to_x = _product(s, w, tl.zeros([ROWS * COLUMNS, HIDDEN], tl.float32), PRECISION)
-                to_x = tl.where(x > 0, g[:, None] * to_x, 0.0)
-                to_x = tl.reshape(to_x, [ROWS, COLUMNS, HIDDEN])
+                to_x = tl.reshape(tl.where(x > 0, g[:, None] * to_x, 0.0), [ROWS, COLUMNS, HIDDEN])
                 to_obj += tl.sum(to_x, 0)
-                row = start_i + tl.arange(0, ROWS)
-                tl.atomic_add(grad_hand + (side * n + row)[:, None] * width + h[None, :], tl.sum(to_x, 1),
-                              mask=(row < n)[:, None] & (h < width)[None, :], sem="relaxed")
-            column = start_j + tl.arange(0, COLUMNS)
-            tl.store(grad_obj + (side * m + column)[:, None] * width + h[None, :], to_obj,
-                     mask=(column < m)[:, None] & (h < width)[None, :])
-    place = (sample * tl.num_programs(1) + part) * outputs + k
-    tl.store(shares + place[:, None] * width + h[None, :], share, mask=known)
-    tl.store(counts + place, count, mask=(k < outputs) & (tl.program_id(0) == 0))
+                tl.atomic_add(grad_hand + (side * n + i)[:, None] * width + h[None, :], tl.sum(to_x, 1),
+                              mask=(i < n)[:, None] & (h < width)[None, :], sem="relaxed")
+            tl.store(grad_obj + (side * m + j)[:, None] * width + h[None, :], to_obj,
+                     mask=(j < m)[:, None] & (h < width)[None, :])
+    to = (sample * tl.num_programs(1) + part) * outputs + k
+    tl.store(shares + to[:, None] * width + h[None, :], share, mask=known)
+
+
+@triton.jit
+def _pairs_counts(  # type: ignore[no-untyped-def]
+    grad, signs, counts, batch, pairs: tl.constexpr, outputs: tl.constexpr, COUNTED: tl.constexpr, OUTPUTS: tl.constexpr,
+):
+    """Sum of half the gradients of a sample's pairs, in both orders, where a unit of the second layer is above zero."""
+    sample, k = tl.program_id(0).to(tl.int64), tl.arange(0, OUTPUTS)
+    total = tl.zeros([COUNTED, OUTPUTS], tl.float32)
+    for start in range(0, pairs, COUNTED):
+        place = start + tl.arange(0, COUNTED)
+        inside = place < pairs
+        g = 0.5 * tl.load(grad + sample * pairs + place, mask=inside, other=0.0)
+        for order in range(2):
+            total += g[:, None] * _above(signs, (order * batch + sample) * pairs, place, inside, OUTPUTS)
+    tl.store(counts + sample * outputs + k, tl.sum(total, 0), mask=k < outputs)
 
 
 class PairLayers(torch.autograd.Function):
     """Mean over both orders of the hidden layers' output, for every pair; twin of `distance_head.PairLayers`."""
 
     @staticmethod
-    def forward(
+    def forward(  # noqa: D102
         ctx: Any, hand: Float[Tensor, "2 b n h"], obj: Float[Tensor, "2 b m h"], weight: Float[Tensor, "k h"],
         bias: Float[Tensor, " k"], last: Float[Tensor, " k"], rounded: bool,
     ) -> Float[Tensor, "b n m"]:
@@ -144,13 +183,13 @@ class PairLayers(torch.autograd.Function):
         ctx.precision = ROUNDED if rounded else EXACT
         _pairs_forward[(tiles, b)](
             hand, obj, weight, bias, last, out, signs, b, n, m, width, outputs, ROWS=ROWS, COLUMNS=COLUMNS, HIDDEN=HIDDEN,
-            OUTPUTS=padded, PRECISION=ctx.precision, KEEP=keep, num_warps=WARPS)
+            OUTPUTS=padded, PRECISION=ctx.precision, KEEP=keep, num_warps=WARPS, num_stages=1)
         ctx.save_for_backward(hand, obj, weight, bias, last, signs)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(  # noqa: D102  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *grad_outputs: Float[Tensor, "b n m"]
     ) -> tuple[Float[Tensor, "..."] | None, ...]:
         hand, obj, weight, bias, last, signs = ctx.saved_tensors
@@ -160,11 +199,12 @@ class PairLayers(torch.autograd.Function):
         steps = triton.cdiv(triton.cdiv(m, COLUMNS), parts)
         parts = triton.cdiv(m, COLUMNS * steps)
         grad_hand, grad_obj = torch.zeros_like(hand), torch.empty_like(obj)
-        shares, counts = hand.new_empty(b * parts, outputs, width), hand.new_empty(b * parts, outputs)
+        shares, counts = hand.new_empty(b * parts, outputs, width), hand.new_empty(b, outputs)
+        grad, padded = grad_outputs[0].contiguous(), signs.shape[-1] * 32
         _pairs_backward[(blocks, parts, b)](
-            hand, obj, weight, last, grad_outputs[0].contiguous(), signs, grad_hand, grad_obj, shares, counts, b, n, m, width,
-            outputs, steps, ROWS=ROWS, COLUMNS=COLUMNS, HIDDEN=HIDDEN, OUTPUTS=signs.shape[-1] * 32, PRECISION=ctx.precision,
-            num_warps=WARPS)
+            hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, b, n, m, width, outputs, steps, ROWS=ROWS,
+            COLUMNS=COLUMNS, HIDDEN=HIDDEN, OUTPUTS=padded, PRECISION=ctx.precision, num_warps=WARPS, num_stages=1)
+        _pairs_counts[(b,)](grad, signs, counts, b, n * m, outputs, COUNTED=COUNTED, OUTPUTS=padded)
         share, count = shares.sum(0), counts.sum(0)
         # The second layer is linear where it is above zero, so its mean output follows from the same sums.
         grad_last = (weight * share).sum(1) + bias * count
@@ -234,7 +274,7 @@ class Neighbours(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(  # noqa: D102  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *grad_outputs: Float[Tensor, "b n d"]
     ) -> tuple[Float[Tensor, "b n d"] | None, ...]:
         source, adjacency = ctx.saved_tensors
@@ -242,9 +282,8 @@ class Neighbours(torch.autograd.Function):
         with torch.autocast(source.device.type, torch.bfloat16, enabled=ctx.mixed):
             out = torch.zeros_like(of_highest) if adjacency is None else (adjacency.mT @ of_total).float()
         _, n, width = source.shape
-        block = 1024
-        _neighbours_backward[(triton.cdiv(source.numel(), block),)](
-            of_highest.contiguous(), source, out, n, width, source.numel(), BLOCK=block)
+        _neighbours_backward[(triton.cdiv(source.numel(), SCATTERED),)](
+            of_highest.contiguous(), source, out, n, width, source.numel(), BLOCK=SCATTERED)
         return out, None, None, None
 
 

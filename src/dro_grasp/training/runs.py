@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, distributed, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -258,13 +258,13 @@ class Ahead:
     """Draws the samples of the next shard in a thread, on a stream of its own, while a GPU computes the losses of this one."""
 
     def __init__(self, generator: torch.Generator, kept: int) -> None:
-        """`generator` goes on after the samples as if it had drawn them; `kept` shards are computed before the GPU is waited for."""
+        """Make ready; `generator` goes on as if it had drawn the samples. The GPU is waited for every `kept` shards."""
         self.generator, device = generator, generator.device
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         if self._stream is not None:
             self._stream.wait_stream(torch.cuda.current_stream(device))
         self._thread = ThreadPoolExecutor(1)
-        self._begun: dict[int, Future[tuple[Any, Tensor, torch.cuda.Event | None]]] = {}
+        self._begun: dict[int, Future[tuple[Any, Int[Tensor, " state"], Any]]] = {}
         # The stream's memory may be used again only once the losses have been computed.
         self._kept: deque[Any] = deque(maxlen=kept)
 
@@ -278,7 +278,7 @@ class Ahead:
         self._kept.append(samples)
         return samples
 
-    def _drawn(self, draw: Callable[[torch.Generator], Any], seed: int) -> tuple[Any, Tensor, torch.cuda.Event | None]:
+    def _drawn(self, draw: Callable[[torch.Generator], Any], seed: int) -> tuple[Any, Int[Tensor, " state"], Any]:
         generator = torch.Generator(self.generator.device)
         generator.manual_seed(seed)
         if self._stream is None:
