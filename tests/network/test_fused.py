@@ -36,7 +36,7 @@ def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     if request.param == "interpreter":
-        if torch.cuda.is_available() or "triton" in sys.modules and not os.environ.get("TRITON_INTERPRET"):
+        if torch.cuda.is_available() or ("triton" in sys.modules and not os.environ.get("TRITON_INTERPRET")):
             pytest.skip("Triton is imported as a compiler; set TRITON_INTERPRET=1")
         os.environ["TRITON_INTERPRET"] = "1"  # read as Triton is imported
     from dro_grasp.network import fused
