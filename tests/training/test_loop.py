@@ -22,7 +22,7 @@ from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.training.runs import recalibrate
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.loaded_hands import loaded_hand
-from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
+from tests.helpers.tiny_bundle import TINY, ellipsoid, made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
 
@@ -127,10 +127,13 @@ class Predicted:
         return NetworkOutput(distances, torch.zeros(len(hand), 1), torch.zeros(len(hand), 1), torch.zeros(len(hand)), hand)
 
 
-def test_losses_of_several_hands_are_those_of_each_by_itself(tmp_path: Path) -> None:
-    hands, clouds = [toy_hand().with_points(96), loaded_hand("gripper3").with_points(96)], {"egg": ellipsoid(SEMIAXES["egg"])}
+@pytest.mark.parametrize(("points", "links"), [(48, [7, 1]), (96, [7, 21])], ids=["points that have no link", "padded links"])
+def test_losses_of_several_hands_are_those_of_each_by_itself(points: int, links: list[int], tmp_path: Path) -> None:
+    hands, clouds = [toy_hand(), loaded_hand("allegro")], {"egg": ellipsoid((0.12, 0.1, 0.11))}
     both = write_bundle(tmp_path / "b.safetensors", hands, clouds, [made_up_grasps(hand, "egg") for hand in hands])
-    source = SampleSource(both, TINY, AugmentationConfig())
+    source = SampleSource(both, dataclasses.replace(TINY, n_hand=points), AugmentationConfig())
+    assert source.segments.real.sum(1).tolist() == links
+    assert bool(source.segments.kept.all()) == (points == 96)
     groups = [source.draw(hand.name, 3, torch.Generator().manual_seed(i)) for i, hand in enumerate(hands)]
     found = loop.step_losses(Predicted(), groups, TrainConfig(columns=24), torch.Generator().manual_seed(2))
     obj, grasp = (torch.cat([getattr(g, name) for g in groups]) for name in ("obj", "grasp"))
@@ -147,6 +150,7 @@ def test_losses_of_several_hands_are_those_of_each_by_itself(tmp_path: Path) -> 
         nearest = torch.cdist(posed, group.obj).argmin(-1)
         rows = torch.arange(3)[:, None]
         depths.append((-((posed - group.obj[rows, nearest]) * group.normals[rows, nearest]).sum(-1)).clamp(min=0).mean(1))
+    assert min(float(each.max()) for each in depths) > 0
     assert float(found["pose"]) == pytest.approx(float(torch.cat(poses).mean()), rel=1e-4)
     assert float(found["penetration"]) == pytest.approx(float(torch.cat(depths).mean()), rel=1e-4)
 
