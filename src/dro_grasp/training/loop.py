@@ -108,9 +108,8 @@ def _drawing(
     source: SampleSource, config: TrainConfig | PlacementConfig
 ) -> Callable[[torch.Generator], list[HandSamples]]:
     """What draws the samples of a shard."""
-    return lambda generator: [
-        source.draw(hand, config.samples_per_hand, generator)
-        for hand in source.draw_hands(config.hands_per_step, generator, config.by_count)]
+    return lambda generator: source.draw_all(
+        source.draw_hands(config.hands_per_step, generator, config.by_count), config.samples_per_hand, generator)
 
 
 def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
