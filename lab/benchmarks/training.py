@@ -67,7 +67,7 @@ def made_up_grasps(hand: Hand, obj: str, generator: torch.Generator) -> GraspBat
     """Grasps with the object near the hand's grasp centre, in random rotation."""
     rotation = random_rotations(GRASPS, generator)
     shift = 0.003 * torch.randn(GRASPS, 3, generator=generator) - rotation @ hand.grasp_centre_wrist
-    about = SimpleNamespace(name=obj, sha256=obj, split="train")
+    about: Any = SimpleNamespace(name=obj, sha256=obj, split="train")
     return GraspBatch.create(hand, about, compose(rotation, shift), hand.random_joints(GRASPS, generator))
 
 
@@ -99,7 +99,7 @@ def told(profiler: profile, gpu: bool) -> str:
     launches = sum(e.count for e in events if "LaunchKernel" in e.key)
     waits = sum(e.count for e in events if "Synchronize" in e.key)
     time: Callable[[Any], float] = (lambda e: e.self_device_time_total) if gpu else (lambda e: e.self_cpu_time_total)
-    found = sorted((e for e in events if not gpu or e.device_type == torch.autograd.DeviceType.CUDA), key=time, reverse=True)
+    found = sorted((e for e in events if not gpu or str(e.device_type).endswith("CUDA")), key=time, reverse=True)
     head = f"{launches} launches, {waits} waits, {sum(map(time, found)) / 1e3:.1f} ms"
     return "\n".join([head, *(f"{time(e) / 1e3:9.2f} ms {e.count:6d} x {e.key[:100]}" for e in found[:SHOWN])])
 

@@ -115,10 +115,10 @@ def decode_segments(
     segments = segments.spread(len(distances))
     both, flat = multilaterate(distances, object_points, config.multilateration)
     points = both[:, 0]
-    if bool(flat.any()):
-        second = _sides(segments.rows(flat), both[flat].detach(), distances[flat].detach(), object_points[flat], config)
-        chosen = torch.where(second[..., None], both[flat, 1], both[flat, 0])
-        points = points.index_put((flat.nonzero()[:, 0],), chosen)
+    rows = flat.nonzero()[:, 0]
+    if len(rows):
+        second = _sides(segments.rows(rows), both[rows].detach(), distances[rows].detach(), object_points[rows], config)
+        points = points.index_put((rows,), torch.where(second[..., None], both[rows, 1], both[rows, 0]))
     poses, residual = register(segments.local, segments.of_points(points), segments.weight)
     return poses, residual, points
 

@@ -29,7 +29,7 @@ class GatheredNeighbours:
 
 
 @pytest.fixture(params=["interpreter", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[ModuleType, str]:
+def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, as_users_have_it: None) -> tuple[ModuleType, str]:
     """The module of kernels, and the device on which they run; layers on that device use them."""
     if importlib.util.find_spec("triton") is None:
         pytest.skip("no Triton; it comes with PyTorch for CUDA, and `pip install triton` brings the interpreter")
@@ -72,6 +72,13 @@ def test_pairs_equal_the_chunked_form_in_double_precision(
         assert torch.equal(head(hand, obj), head(hand.detach(), obj.detach()))
 
 
+@pytest.mark.parametrize(("n", "k"), [(9, 9), (100, 7)])
+def test_nearest_points_are_those_that_sorting_finds(kernels: tuple[ModuleType, str], n: int, k: int) -> None:
+    points = torch.randn(2, n, 3, device=kernels[1], generator=torch.Generator(kernels[1]).manual_seed(0))
+    exact = (points.double()[:, :, None] - points.double()[:, None]).norm(dim=-1).argsort(-1)[..., :k]
+    assert torch.equal(encoder.nearest_neighbours(points, k), exact)
+
+
 def check_edge_layer(device: str, n: int, width: int, tolerance: float) -> None:
     """Features, gradients and running statistics of a layer whose scales have both signs; then its evaluation."""
     torch.manual_seed(0)
@@ -98,5 +105,5 @@ def test_edge_layers_equal_their_plain_form_in_double_precision(kernels: tuple[M
 
 
 def test_edge_layers_make_the_right_use_of_sums_over_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoder, "fused_kernels", lambda _: SimpleNamespace(Neighbours=GatheredNeighbours))
+    monkeypatch.setattr(encoder, "fused_kernels", lambda _: SimpleNamespace(Neighbours=GatheredNeighbours, COMPARED=0))
     check_edge_layer("cpu", 30, 12, 2e-5)

@@ -58,8 +58,7 @@ def multilaterate(
         height = _height(plain, distances, cloud)[..., None] * normal
         # The closed form carries a large error along the thin axis; the height comes from the distances alone.
         level = plain - (plain * normal).sum(-1, keepdim=True) * normal
-        sides = [_refine_where(flat, level + sign * height, distances, cloud, config) for sign in (1.0, -1.0)]
-        both = torch.where(flat[..., None, None, None], torch.stack(sides, -3), both)
+        both = _refine_where(flat, torch.stack([level + height, level - height], -3), both, distances, cloud, config)
     return both + cloud.centre[..., None, :, :], flat
 
 
@@ -102,17 +101,17 @@ def _height(start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], 
 
 
 def _refine_where(
-    chosen: Bool[Tensor, "*b"], start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud,
-    config: MultilaterationConfig,
-) -> Float[Tensor, "*b n 3"]:
-    """Refine the chosen clouds of the batch and leave the others."""
+    chosen: Bool[Tensor, "*b"], start: Float[Tensor, "*b 2 n 3"], otherwise: Float[Tensor, "*b 2 n 3"],
+    distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig,
+) -> Float[Tensor, "*b 2 n 3"]:
+    """Refine the chosen clouds of the batch from both sides, and leave the others."""
     shape, n, m = start.shape, start.shape[-2], cloud.points.shape[-2]
     rows = chosen.reshape(-1).nonzero()[:, 0]
-    start, distances = start.reshape(-1, n, 3), distances.reshape(-1, n, m)
-    anchors = cloud.points.reshape(-1, m, 3)
+    start, distances = start.reshape(-1, 2, n, 3), distances.reshape(-1, 1, n, m)
+    anchors = cloud.points.reshape(-1, 1, m, 3)
     chunk = config.chunk if rows.device.type == "cpu" else len(rows)
     parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(chunk)]
-    return start.index_put((rows,), torch.cat(parts)).reshape(shape)
+    return otherwise.reshape(-1, 2, n, 3).index_put((rows,), torch.cat(parts)).reshape(shape)
 
 
 def _refine(
@@ -139,7 +138,7 @@ def _step(
     with torch.no_grad():
         matrix = _outer_products(points, current.square().reciprocal(), anchors)
         matrix = matrix + config.damping * anchors.shape[-2] * torch.eye(3, dtype=points.dtype, device=points.device)
-        inverse = torch.linalg.inv(matrix)
+        inverse = torch.linalg.inv_ex(matrix).inverse  # which does not wait for a GPU; the damping keeps it regular
     pull = 1 - distances / current
     gradient = points * pull.sum(-1, keepdim=True) - pull @ anchors
     step = -(inverse @ gradient[..., None])[..., 0]
@@ -195,9 +194,9 @@ def choose_sides(
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)
     starts = (torch.zeros_like(cut), torch.ones_like(cut), cut, ~cut)
-    results = [_settle(local, weight, candidates, misfit, start, config) for start in starts]
-    picks, errors = torch.stack([r[0] for r in results], 1), torch.stack([r[1] for r in results], 1)
     weight = weight.expand(len(candidates), -1, -1)[:, None]
+    local = local.expand(len(candidates), -1, -1, -1)
+    picks, errors = _settle(local, weight, candidates, misfit, torch.stack(starts, 1), config)
     mostly_second = (picks * weight).sum(-1) > 0.5 * weight.sum(-1)
     reference = torch.as_tensor(reference, device=errors.device).expand(len(errors))[:, None, None].expand(-1, len(starts), 1)
     best = errors.gather(2, reference)[..., 0].argmin(1)
@@ -231,17 +230,16 @@ def _cut(
 
 
 def _settle(
-    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b l p"], config: SideConfig,
-) -> tuple[Bool[Tensor, "b l p"], Float[Tensor, "b l"]]:
-    """Alternate between picking and registering; returns the picks and each body's mean squared error [m^2]."""
-    local = local.expand(len(candidates), -1, -1, -1)
-    weight = weight.expand(len(candidates), -1, -1)
-    away = misfit
+    local: Float[Tensor, "b l p 3"], weight: Float[Tensor, "b 1 l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b s l p"], config: SideConfig,
+) -> tuple[Bool[Tensor, "b s l p"], Float[Tensor, "b s l"]]:
+    """Alternate between picking and registering from each start; returns the picks and each body's mean squared error [m^2]."""
+    local, weight = local[:, None].expand(*second.shape, 3), weight.expand(second.shape)
+    away = misfit[:, None]
     for _ in range(config.rounds):
-        points = torch.where(second[..., None], candidates[:, 1], candidates[:, 0])
+        points = torch.where(second[..., None], candidates[:, None, 1], candidates[:, None, 0])
         T, _ = register(local, points, weight)
         posed = apply_to_cloud(T, local)
-        away = (candidates - posed[:, None]).square().sum(-1) + misfit
-        second = away[:, 1] < away[:, 0]
-    return second, (away.amin(1) * weight).sum(-1) / weight.sum(-1)
+        away = (candidates[:, None] - posed[:, :, None]).square().sum(-1) + misfit[:, None]
+        second = away[:, :, 1] < away[:, :, 0]
+    return second, (away.amin(2) * weight).sum(-1) / weight.sum(-1)

@@ -4,6 +4,7 @@ Imported only where there is a CUDA device and Triton. Both kernels keep in regi
 hidden layers of pairs, and the values of neighbours. Source: ours.
 """
 
+# pyright: reportMissingImports=false, reportIndexIssue=false
 from __future__ import annotations
 
 from typing import Any
@@ -17,13 +18,13 @@ from torch.autograd.function import once_differentiable
 
 BITS = tl.constexpr(32)
 """Signs in a word."""
-ROWS = 8
+ROWS = 4
 """Hand points of a tile of pairs. Source: ours, timed."""
 COLUMNS = 16
 """Object points of a tile of pairs. Source: ours, timed."""
 HIDDEN = 64
 """Units of the first hidden layer that are multiplied at a time. Source: ours, timed."""
-WARPS = 8
+WARPS = 4
 """Warps of a program on pairs. Source: ours, timed."""
 COUNTED = 64
 """Pairs whose signs are counted at a time. Source: ours."""
@@ -33,8 +34,10 @@ CHANNELS = 32
 """Channels of a tile of neighbours. Source: ours, timed."""
 SCATTERED = 1024
 """Gradients that a program adds to neighbours. Source: ours."""
-PROGRAMS = 512
-"""Programs that keep a large card busy: small batches are split until there are so many. Source: ours."""
+SIDE = 64
+"""Object points of the backward pass, each with one hand point at a time. Source: ours, timed."""
+COMPARED = 4096
+"""Distances that a program on nearest points keeps. Source: ours."""
 EXACT = "tf32x3"
 """Products as exact as single precision, in three parts."""
 ROUNDED = "bf16"
@@ -112,39 +115,34 @@ def _above(signs, first, place, inside, OUTPUTS: tl.constexpr):  # type: ignore[
 @triton.jit
 def _pairs_backward(  # type: ignore[no-untyped-def]
     hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, batch, n: tl.constexpr, m: tl.constexpr,
-    width: tl.constexpr, outputs: tl.constexpr, steps: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
-    HIDDEN: tl.constexpr, OUTPUTS: tl.constexpr, PRECISION: tl.constexpr,
+    width: tl.constexpr, outputs: tl.constexpr, SIDE: tl.constexpr, HIDDEN: tl.constexpr, OUTPUTS: tl.constexpr,
+    PRECISION: tl.constexpr,
 ):
-    """Some units of the first layer, for some object points of a sample and all hand points.
+    """Some units of the first layer, for some object points of a sample and one hand point after the other.
 
     With s = 1 where a unit of the second layer is above zero, the gradient of a pair by the first layer is g (s * last) W. The
     gradients of weights follow from the sums over pairs of g s^T x (`shares`) and g s (`_pairs_counts`).
     """
     sample, part = tl.program_id(2).to(tl.int64), tl.program_id(1)
-    h, k = tl.program_id(0) * HIDDEN + tl.arange(0, HIDDEN), tl.arange(0, OUTPUTS)
-    known = (k < outputs)[:, None] & (h < width)[None, :]
+    h, k, j = tl.program_id(0) * HIDDEN + tl.arange(0, HIDDEN), tl.arange(0, OUTPUTS), part * SIDE + tl.arange(0, SIDE)
+    known, there = (k < outputs)[:, None] & (h < width)[None, :], (j < m)[:, None] & (h < width)[None, :]
     w = tl.load(weight + k[:, None] * width + h[None, :], mask=known, other=0.0)
     w = w * tl.load(last + k, mask=k < outputs, other=0.0)[:, None]
     share = tl.zeros([OUTPUTS, HIDDEN], tl.float32)
     for order in range(2):
         side = order * batch + sample
-        for step in range(steps):
-            j = (part * steps + step) * COLUMNS + tl.arange(0, COLUMNS)
-            to_obj = tl.zeros([COLUMNS, HIDDEN], tl.float32)
-            for start in range(0, n, ROWS):
-                i = start + tl.arange(0, ROWS)
-                place, inside = _places(i, j, n, m)
-                x = _first(hand, obj, i, j, h, side, n, m, width)
-                g = 0.5 * tl.load(grad + sample * n * m + place, mask=inside, other=0.0)
-                s = _above(signs, side * n * m, place, inside, OUTPUTS)
-                share = _product(tl.trans(s), g[:, None] * tl.maximum(x, 0.0), share, PRECISION)
-                to_x = _product(s, w, tl.zeros([ROWS * COLUMNS, HIDDEN], tl.float32), PRECISION)
-                to_x = tl.reshape(tl.where(x > 0, g[:, None] * to_x, 0.0), [ROWS, COLUMNS, HIDDEN])
-                to_obj += tl.sum(to_x, 0)
-                tl.atomic_add(grad_hand + (side * n + i)[:, None] * width + h[None, :], tl.sum(to_x, 1),
-                              mask=(i < n)[:, None] & (h < width)[None, :], sem="relaxed")
-            tl.store(grad_obj + (side * m + j)[:, None] * width + h[None, :], to_obj,
-                     mask=(j < m)[:, None] & (h < width)[None, :])
+        own = tl.load(obj + (side * m + j)[:, None] * width + h[None, :], mask=there, other=0.0)
+        to_obj = tl.zeros([SIDE, HIDDEN], tl.float32)
+        for i in range(n):
+            x = own + tl.load(hand + (side * n + i) * width + h, mask=h < width, other=0.0)[None, :]
+            g = 0.5 * tl.load(grad + (sample * n + i) * m + j, mask=j < m, other=0.0)
+            s = _above(signs, side * n * m, i * m + j, j < m, OUTPUTS)
+            share = _product(tl.trans(s), g[:, None] * tl.maximum(x, 0.0), share, PRECISION)
+            to_x = _product(s, w, tl.zeros([SIDE, HIDDEN], tl.float32), PRECISION)
+            to_x = tl.where(x > 0, g[:, None] * to_x, 0.0)
+            to_obj += to_x
+            tl.atomic_add(grad_hand + (side * n + i) * width + h, tl.sum(to_x, 0), mask=h < width, sem="relaxed")
+        tl.store(grad_obj + (side * m + j)[:, None] * width + h[None, :], to_obj, mask=there)
     to = (sample * tl.num_programs(1) + part) * outputs + k
     tl.store(shares + to[:, None] * width + h[None, :], share, mask=known)
 
@@ -194,21 +192,45 @@ class PairLayers(torch.autograd.Function):
     ) -> tuple[Float[Tensor, "..."] | None, ...]:
         hand, obj, weight, bias, last, signs = ctx.saved_tensors
         (_, b, n, width), m, outputs = hand.shape, obj.shape[2], len(weight)
-        blocks = triton.cdiv(width, HIDDEN)
-        parts = min(triton.cdiv(m, COLUMNS), max(1, PROGRAMS // (blocks * b)))
-        steps = triton.cdiv(triton.cdiv(m, COLUMNS), parts)
-        parts = triton.cdiv(m, COLUMNS * steps)
+        parts = triton.cdiv(m, SIDE)
         grad_hand, grad_obj = torch.zeros_like(hand), torch.empty_like(obj)
         shares, counts = hand.new_empty(b * parts, outputs, width), hand.new_empty(b, outputs)
         grad, padded = grad_outputs[0].contiguous(), signs.shape[-1] * 32
-        _pairs_backward[(blocks, parts, b)](
-            hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, b, n, m, width, outputs, steps, ROWS=ROWS,
-            COLUMNS=COLUMNS, HIDDEN=HIDDEN, OUTPUTS=padded, PRECISION=ctx.precision, num_warps=WARPS, num_stages=1)
+        _pairs_backward[(triton.cdiv(width, HIDDEN), parts, b)](
+            hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, b, n, m, width, outputs, SIDE=SIDE,
+            HIDDEN=HIDDEN, OUTPUTS=padded, PRECISION=ctx.precision, num_warps=WARPS, num_stages=1)
         _pairs_counts[(b,)](grad, signs, counts, b, n * m, outputs, COUNTED=COUNTED, OUTPUTS=padded)
         share, count = shares.sum(0), counts.sum(0)
         # The second layer is linear where it is above zero, so its mean output follows from the same sums.
         grad_last = (weight * share).sum(1) + bias * count
         return grad_hand, grad_obj, last[:, None] * share, last * count, grad_last, None
+
+
+@triton.jit
+def _nearest(points, index, n: tl.constexpr, k: tl.constexpr, POINTS: tl.constexpr, PADDED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The k nearest points of some points, the nearest first: the least distance is found, and then left out."""
+    sample = tl.program_id(1).to(tl.int64)
+    i, j = tl.program_id(0) * POINTS + tl.arange(0, POINTS), tl.arange(0, PADDED)
+    squared = tl.zeros([POINTS, PADDED], tl.float32)
+    for axis in tl.static_range(3):
+        a = tl.load(points + (sample * n + i) * 3 + axis, mask=i < n, other=0.0)
+        b = tl.load(points + (sample * n + j) * 3 + axis, mask=j < n, other=0.0)
+        squared += (a[:, None] - b[None, :]) * (a[:, None] - b[None, :])
+    squared = tl.where((j < n)[None, :], squared, float("inf"))
+    for rank in range(k):
+        least = tl.argmin(squared, 1)
+        tl.store(index + (sample * n + i) * k + rank, least, mask=i < n)
+        squared = tl.where(j[None, :] == least[:, None], float("inf"), squared)
+
+
+def nearest(points: Float[Tensor, "b n 3"], k: int) -> Int[Tensor, "b n k"]:
+    """Indices of the k nearest points of each point, itself included, the nearest first."""
+    b, n, _ = points.shape
+    padded = triton.next_power_of_2(n)
+    index = torch.empty(b, n, k, dtype=torch.int32, device=points.device)
+    some = max(1, COMPARED // padded)
+    _nearest[(triton.cdiv(n, some), b)](points.contiguous(), index, n, k, POINTS=some, PADDED=padded)
+    return index
 
 
 @triton.jit
