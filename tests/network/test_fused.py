@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 import torch
@@ -16,16 +16,6 @@ from dro_grasp.network.distance_head import DistanceHead
 from dro_grasp.network.encoder import EdgeLayer, Graph, nearest_neighbours
 from tests.network.test_distance_head import naive_distances
 from tests.network.test_network import plain_edge_layer
-
-
-class GatheredNeighbours:
-    """What the kernel of neighbours does, by writing them all."""
-
-    @staticmethod
-    def apply(values: Tensor, sign: Tensor, index: Tensor, adjacency: Tensor | None) -> tuple[Tensor, Tensor]:
-        neighbours = values[torch.arange(len(values))[:, None, None], index.long()]
-        total = neighbours.sum(2)
-        return (neighbours * sign).amax(2) * sign, total if adjacency is not None else total.detach()
 
 
 @pytest.fixture(params=["interpreter", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -79,8 +69,9 @@ def test_nearest_points_are_those_that_sorting_finds(kernels: tuple[ModuleType, 
     assert torch.equal(encoder.nearest_neighbours(points, k), exact)
 
 
-def check_edge_layer(device: str, n: int, width: int, tolerance: float) -> None:
-    """Features, gradients and running statistics of a layer whose scales have both signs; then its evaluation."""
+@pytest.mark.parametrize(("n", "width"), [(30, 12), (40, 70)])
+def test_edge_layers_equal_their_plain_form_in_double_precision(kernels: tuple[ModuleType, str], n: int, width: int) -> None:
+    device = kernels[1]
     torch.manual_seed(0)
     layer, norm = EdgeLayer(5, width).to(device), nn.BatchNorm1d(width).double().to(device)
     nn.init.normal_(layer.norm.weight)
@@ -91,19 +82,10 @@ def check_edge_layer(device: str, n: int, width: int, tolerance: float) -> None:
     index, doubled = nearest_neighbours(torch.randn(2, n, 3, device=device), 6), x.detach().double().requires_grad_()
     inputs = [x, layer.linear.weight, layer.norm.weight, layer.norm.bias]
     compare(layer(x, Graph(index)), plain_edge_layer(twin, norm, doubled, index), inputs,
-            [doubled, twin.linear.weight, norm.weight, norm.bias], tolerance)
+            [doubled, twin.linear.weight, norm.weight, norm.bias], 2e-5)
     torch.testing.assert_close(layer.norm.running_var.double(), norm.running_var, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(layer.norm.running_mean.double(), norm.running_mean, rtol=1e-5, atol=1e-6)
     known = plain_edge_layer(twin, norm.eval(), doubled.detach(), index)
     with torch.no_grad():
         torch.testing.assert_close(layer.eval()(x, Graph(index)).double(), known, rtol=1e-4, atol=1e-5)
 
-
-@pytest.mark.parametrize(("n", "width"), [(30, 12), (40, 70)])
-def test_edge_layers_equal_their_plain_form_in_double_precision(kernels: tuple[ModuleType, str], n: int, width: int) -> None:
-    check_edge_layer(kernels[1], n, width, 2e-5)
-
-
-def test_edge_layers_make_the_right_use_of_sums_over_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoder, "fused_kernels", lambda _: SimpleNamespace(Neighbours=GatheredNeighbours, COMPARED=0))
-    check_edge_layer("cpu", 30, 12, 2e-5)

@@ -43,7 +43,7 @@ class DistanceHead(nn.Module):
     ) -> Float[Tensor, "b n m"]:
         """Distances [m], from features of the points with z, and from distances that the kernel corrects, if any [m].
 
-        `rounded` lets a GPU multiply in TF32, whose factors have 10 bits.
+        `rounded` lets a GPU multiply in bfloat16; sums have 32 bits.
         """
         left, right = self.first.weight.chunk(2, 1)
         both = torch.cat([left, right])

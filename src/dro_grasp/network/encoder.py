@@ -34,12 +34,13 @@ class Graph:
     def adjacency(self) -> Float[Tensor, "b n n"]:
         """1 where the second point is a neighbour of the first, else 0."""
         b, n, _ = self.index.shape
-        return torch.zeros(b, n, n, device=self.index.device).scatter_(2, self.index, 1.0)
+        kind = torch.bfloat16 if torch.is_autocast_enabled("cuda") else torch.float32
+        return torch.zeros(b, n, n, dtype=kind, device=self.index.device).scatter_(2, self.index, 1.0)
 
     @cached_property
     def degree(self) -> Float[Tensor, "b n 1"]:
         """Of how many points each is a neighbour."""
-        return self.adjacency.sum(1)[..., None]
+        return self.adjacency.sum(1, dtype=torch.float32)[..., None]
 
     @cached_property
     def narrow(self) -> Int[Tensor, "b n k"]:
@@ -65,29 +66,30 @@ class EdgeLayer(nn.Module):
         difference, centre = self.linear.weight.chunk(2, 1)
         # Single precision from here on: statistics are sums over very many edges.
         neighbour, own = (x @ torch.cat([difference, centre - difference]).T).float().chunk(2, -1)
-        highest, total = self._highest(neighbour, graph)
+        fused = fused_kernels(neighbour)
+        if fused and self.norm.training:
+            out, mean, variance = fused.EdgeMaximum.apply(
+                neighbour, own, self.norm.weight, self.norm.bias, graph.narrow, graph.degree, graph.adjacency, self.norm.eps,
+                SLOPE)
+            self._track(mean, variance, graph)
+            return out
         if self.norm.training:
-            mean, variance = self._batch_statistics(neighbour, own, graph, total)
+            mean, variance = self._batch_statistics(neighbour, own, graph)
         else:
             mean, variance = self.norm.running_mean, self.norm.running_var
             assert mean is not None
             assert variance is not None
-        scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
+        scale, sign = self.norm.weight * torch.rsqrt(variance + self.norm.eps), torch.where(self.norm.weight < 0, -1.0, 1.0)
+        if fused and not neighbour.requires_grad:
+            highest = fused.highest_neighbours(neighbour, sign, graph.narrow)
+        else:
+            highest = self._highest(neighbour, sign.to(neighbour.dtype), graph.index)
         return functional.leaky_relu(torch.addcmul(self.norm.bias - mean * scale, highest + own, scale), SLOPE)
 
     def _highest(
-        self, neighbour: Float[Tensor, "b n d"], graph: Graph
-    ) -> tuple[Float[Tensor, "b n d"], Float[Tensor, "b n d"] | None]:
-        """The value of each point's neighbours that a scale of either sign makes the highest; their sum, if it is at hand."""
-        sign = torch.where(self.norm.weight < 0, -1.0, 1.0).to(neighbour.dtype)
-        if fused := fused_kernels(neighbour):
-            adjacency = graph.adjacency if self.norm.training and neighbour.requires_grad else None
-            return fused.Neighbours.apply(neighbour, sign, graph.narrow, adjacency)
-        return self._highest_in_passes(neighbour, sign, graph.index), None
-
-    def _highest_in_passes(
         self, neighbour: Float[Tensor, "b n d"], sign: Float[Tensor, " d"], index: Int[Tensor, "b n k"]
     ) -> Float[Tensor, "b n d"]:
+        """The value, among each point's neighbours, that a positive or negative scale makes the highest."""
         # Neighbours as rows of the clouds laid end to end.
         start = torch.arange(len(index), device=index.device)[:, None, None] * index.shape[1]
         rows, needs_source = (index + start).flatten(0, 1), neighbour.requires_grad
@@ -105,7 +107,7 @@ class EdgeLayer(nn.Module):
         return neighbour.flatten(0, 1).gather(0, rows.gather(1, position.long())).view_as(neighbour)
 
     def _batch_statistics(
-        self, neighbour: Float[Tensor, "b n d"], own: Float[Tensor, "b n d"], graph: Graph, total: Float[Tensor, "b n d"] | None
+        self, neighbour: Float[Tensor, "b n d"], own: Float[Tensor, "b n d"], graph: Graph
     ) -> tuple[Float[Tensor, " d"], Float[Tensor, " d"]]:
         """Mean and variance over all edges, without forming them; running averages are updated as BatchNorm does."""
         k, edges, degree = graph.index.shape[-1], graph.index.numel(), graph.degree
@@ -113,15 +115,15 @@ class EdgeLayer(nn.Module):
         mean_own = own.mean((0, 1))
         # Squares of centred values: differences of large sums would lose digits.
         left, right = neighbour - mean_neighbour, own - mean_own
-        sums = graph.adjacency @ left if total is None else total - k * mean_neighbour
-        squares = degree * left.square() + k * right.square() + 2 * right * sums
+        squares = degree * left.square() + k * right.square() + 2 * right * (graph.adjacency @ left)
         mean, variance = mean_neighbour + mean_own, squares.sum((0, 1)) / edges
-        self._track(mean.detach(), variance.detach() * (edges / max(edges - 1, 1)))
+        self._track(mean.detach(), variance.detach(), graph)
         return mean, variance
 
     @torch.no_grad()
-    def _track(self, mean: Float[Tensor, " d"], variance: Float[Tensor, " d"]) -> None:
-        norm = self.norm
+    def _track(self, mean: Float[Tensor, " d"], variance: Float[Tensor, " d"], graph: Graph) -> None:
+        norm, edges = self.norm, graph.index.numel()
+        variance = variance * (edges / max(edges - 1, 1))
         if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
             return
         norm.num_batches_tracked += 1

@@ -32,6 +32,10 @@ POINTS = 32
 """Points of a tile of neighbours. Source: ours, timed."""
 CHANNELS = 32
 """Channels of a tile of neighbours. Source: ours, timed."""
+LINES = 32
+"""Rows of a tile of points and channels. Source: ours."""
+STEPS = tl.constexpr(8)
+"""Tiles that a program sums up. Source: ours."""
 SCATTERED = 1024
 """Gradients that a program adds to neighbours. Source: ours."""
 SIDE = 64
@@ -207,7 +211,9 @@ class PairLayers(torch.autograd.Function):
 
 
 @triton.jit
-def _nearest(points, index, n: tl.constexpr, k: tl.constexpr, POINTS: tl.constexpr, PADDED: tl.constexpr):  # type: ignore[no-untyped-def]
+def _nearest(  # type: ignore[no-untyped-def]
+    points, index, n: tl.constexpr, k: tl.constexpr, POINTS: tl.constexpr, PADDED: tl.constexpr,
+):
     """The k nearest points of some points, the nearest first: the least distance is found, and then left out."""
     sample = tl.program_id(1).to(tl.int64)
     i, j = tl.program_id(0) * POINTS + tl.arange(0, POINTS), tl.arange(0, PADDED)
@@ -272,41 +278,198 @@ def _neighbours_backward(  # type: ignore[no-untyped-def]
     tl.atomic_add(out + (first + whose) * width + place % width, g, mask=inside, sem="relaxed")
 
 
-class Neighbours(torch.autograd.Function):
-    """Among each point's neighbours, the value that a sign makes the highest, and the sum of the values."""
+@triton.jit
+def _tile_of(rows, width: tl.constexpr, step, LINES: tl.constexpr, CHANNELS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Rows and places of a tile of points and channels, whether they are there, and the channels."""
+    row = tl.program_id(1).to(tl.int64) * STEPS * LINES + step * LINES + tl.arange(0, LINES)
+    channel = tl.program_id(0) * CHANNELS + tl.arange(0, CHANNELS)
+    return row, row[:, None] * width + channel[None, :], (row < rows)[:, None] & (channel < width)[None, :], channel
+
+
+@triton.jit
+def _edge_means(  # type: ignore[no-untyped-def]
+    values, own, degree, sums, rows, width: tl.constexpr, LINES: tl.constexpr, CHANNELS: tl.constexpr,
+):
+    """Sums over some rows of the values, as often as they are neighbours, and of own values."""
+    of_values, of_own = tl.zeros([CHANNELS], tl.float32), tl.zeros([CHANNELS], tl.float32)
+    for step in range(STEPS):
+        row, place, inside, channel = _tile_of(rows, width, step, LINES, CHANNELS)
+        often = tl.load(degree + row, mask=row < rows, other=0.0)[:, None]
+        of_values += tl.sum(often * tl.load(values + place, mask=inside, other=0.0), 0)
+        of_own += tl.sum(tl.load(own + place, mask=inside, other=0.0), 0)
+    channel = tl.program_id(0) * CHANNELS + tl.arange(0, CHANNELS)
+    to = tl.program_id(1) * 2 * width + channel
+    tl.store(sums + to, of_values, mask=channel < width)
+    tl.store(sums + to + width, of_own, mask=channel < width)
+
+
+@triton.jit
+def _edge_squares(  # type: ignore[no-untyped-def]
+    values, own, total, degree, means, sums, rows, width: tl.constexpr, k: tl.constexpr, LINES: tl.constexpr,
+    CHANNELS: tl.constexpr,
+):
+    """Sum over the edges of some rows of (value + own - mean)^2, of centred values: large sums would lose digits."""
+    squares = tl.zeros([CHANNELS], tl.float32)
+    channel = tl.program_id(0) * CHANNELS + tl.arange(0, CHANNELS)
+    mean_value = tl.load(means + channel, mask=channel < width, other=0.0)[None, :]
+    mean_own = tl.load(means + width + channel, mask=channel < width, other=0.0)[None, :]
+    for step in range(STEPS):
+        row, place, inside, _ = _tile_of(rows, width, step, LINES, CHANNELS)
+        often = tl.load(degree + row, mask=row < rows, other=0.0)[:, None]
+        left = tl.load(values + place, mask=inside, other=0.0) - mean_value
+        right = tl.load(own + place, mask=inside, other=0.0) - mean_own
+        around = tl.load(total + place, mask=inside, other=0.0) - k * mean_value
+        squares += tl.sum(tl.where(inside, often * left * left + k * right * right + 2 * right * around, 0.0), 0)
+    tl.store(sums + tl.program_id(1) * width + channel, squares, mask=channel < width)
+
+
+@triton.jit
+def _edge_out(  # type: ignore[no-untyped-def]
+    highest, own, scale, shift, out, rows, width: tl.constexpr, SLOPE: tl.constexpr, LINES: tl.constexpr,
+    CHANNELS: tl.constexpr,
+):
+    """LeakyReLU of scaled and shifted values."""
+    for step in range(STEPS):
+        _, place, inside, channel = _tile_of(rows, width, step, LINES, CHANNELS)
+        a = tl.load(scale + channel, mask=channel < width, other=0.0)[None, :]
+        b = tl.load(shift + channel, mask=channel < width, other=0.0)[None, :]
+        x = tl.load(highest + place, mask=inside, other=0.0) + tl.load(own + place, mask=inside, other=0.0)
+        tl.store(out + place, tl.where(x * a + b > 0, x * a + b, SLOPE * (x * a + b)), mask=inside)
+
+
+@triton.jit
+def _edge_slopes(  # type: ignore[no-untyped-def]
+    grad, highest, own, scale, shift, means, sums, centred, rows, width: tl.constexpr, SLOPE: tl.constexpr,
+    LINES: tl.constexpr, CHANNELS: tl.constexpr,
+):
+    """Sums over some rows of the gradient before LeakyReLU, and of its product with what is scaled; centred own values."""
+    plain, scaled = tl.zeros([CHANNELS], tl.float32), tl.zeros([CHANNELS], tl.float32)
+    for step in range(STEPS):
+        _, place, inside, channel = _tile_of(rows, width, step, LINES, CHANNELS)
+        a = tl.load(scale + channel, mask=channel < width, other=0.0)[None, :]
+        b = tl.load(shift + channel, mask=channel < width, other=0.0)[None, :]
+        mean_own = tl.load(means + width + channel, mask=channel < width, other=0.0)[None, :]
+        mine = tl.load(own + place, mask=inside, other=0.0)
+        x = tl.load(highest + place, mask=inside, other=0.0) + mine
+        g = tl.load(grad + place, mask=inside, other=0.0)
+        g = tl.where(x * a + b > 0, g, SLOPE * g)
+        plain += tl.sum(g, 0)
+        scaled += tl.sum(g * x, 0)
+        tl.store(centred + place, (mine - mean_own).to(centred.dtype.element_ty), mask=inside)
+    channel = tl.program_id(0) * CHANNELS + tl.arange(0, CHANNELS)
+    to = tl.program_id(1) * 2 * width + channel
+    tl.store(sums + to, plain, mask=channel < width)
+    tl.store(sums + to + width, scaled, mask=channel < width)
+
+
+@triton.jit
+def _edge_gradients(  # type: ignore[no-untyped-def]
+    grad, highest, own, total, values, degree, around, scale, shift, means, by_mean, by_variance, through, to_own, to_values,
+    rows, width: tl.constexpr, k: tl.constexpr, SLOPE: tl.constexpr, LINES: tl.constexpr, CHANNELS: tl.constexpr,
+):
+    """Gradients by own values, and those by values that do not come through the maximum; `through` is the part that does."""
+    for step in range(STEPS):
+        row, place, inside, channel = _tile_of(rows, width, step, LINES, CHANNELS)
+        known = channel < width
+        a = tl.load(scale + channel, mask=known, other=0.0)[None, :]
+        b = tl.load(shift + channel, mask=known, other=0.0)[None, :]
+        mean_value = tl.load(means + channel, mask=known, other=0.0)[None, :]
+        mean_own = tl.load(means + width + channel, mask=known, other=0.0)[None, :]
+        d_mean = tl.load(by_mean + channel, mask=known, other=0.0)[None, :]
+        d_square = 2 * tl.load(by_variance + channel, mask=known, other=0.0)[None, :]
+        often = tl.load(degree + row, mask=row < rows, other=0.0)[:, None]
+        mine = tl.load(own + place, mask=inside, other=0.0)
+        x = tl.load(highest + place, mask=inside, other=0.0) + mine
+        g = tl.load(grad + place, mask=inside, other=0.0)
+        g = tl.where(x * a + b > 0, g, SLOPE * g) * a
+        near = tl.load(total + place, mask=inside, other=0.0) - k * mean_value
+        tl.store(through + place, g, mask=inside)
+        tl.store(to_own + place, g + k * d_mean + d_square * (k * (mine - mean_own) + near), mask=inside)
+        value = tl.load(values + place, mask=inside, other=0.0) - mean_value
+        others = tl.load(around + place, mask=inside, other=0.0).to(tl.float32)
+        tl.store(to_values + place, often * d_mean + d_square * (often * value + others), mask=inside)
+
+
+def _maxima(
+    values: Float[Tensor, "b n d"], sign: Float[Tensor, " d"], index: Int[Tensor, "b n k"]
+) -> tuple[Float[Tensor, "b n d"], Int[Tensor, "b n d"], Float[Tensor, "b n d"]]:
+    """Highest values of sign * values among neighbours, whose they are, and sums of the values."""
+    b, n, width = values.shape
+    highest, total = torch.empty_like(values), torch.empty_like(values)
+    source = torch.empty(values.shape, dtype=torch.int16, device=values.device)
+    grid = (triton.cdiv(n, POINTS), triton.cdiv(width, CHANNELS), b)
+    _neighbours_forward[grid](
+        values, sign, index, highest, source, total, n, index.shape[2], width, POINTS=POINTS, CHANNELS=CHANNELS)
+    return highest, source, total
+
+
+def highest_neighbours(
+    values: Float[Tensor, "b n d"], sign: Float[Tensor, " d"], index: Int[Tensor, "b n k"]
+) -> Float[Tensor, "b n d"]:
+    """Among each point's neighbours, the value that a sign makes the highest; without a gradient."""
+    return _maxima(values.contiguous(), sign.contiguous(), index)[0]
+
+
+class EdgeMaximum(torch.autograd.Function):
+    """LeakyReLU(BatchNorm(value of a neighbour + own)), the highest over neighbours, with the statistics of all edges.
+
+    In twelve passes over points where autograd takes some seventy.
+    """
 
     @staticmethod
-    def forward(
-        ctx: Any, values: Float[Tensor, "b n d"], sign: Float[Tensor, " d"], index: Int[Tensor, "b n k"],
-        adjacency: Float[Tensor, "b n n"] | None,
-    ) -> tuple[Float[Tensor, "b n d"], Float[Tensor, "b n d"]]:
-        """The index has 32 bits. `adjacency` has 1 for each edge; without it, the sum has no gradient."""
-        values, ctx.mixed = values.contiguous(), torch.is_autocast_enabled(values.device.type)
-        b, n, width = values.shape
-        highest, total = torch.empty_like(values), torch.empty_like(values)
-        source = torch.empty(values.shape, dtype=torch.int16, device=values.device)
-        grid = (triton.cdiv(n, POINTS), triton.cdiv(width, CHANNELS), b)
-        _neighbours_forward[grid](
-            values, sign.contiguous(), index, highest, source, total, n, index.shape[2], width, POINTS=POINTS,
-            CHANNELS=CHANNELS)
-        ctx.save_for_backward(source, adjacency)
-        if adjacency is None:
-            ctx.mark_non_differentiable(total)
-        return highest, total
+    def forward(  # noqa: D102
+        ctx: Any, values: Float[Tensor, "b n d"], own: Float[Tensor, "b n d"], weight: Float[Tensor, " d"],
+        bias: Float[Tensor, " d"], index: Int[Tensor, "b n k"], degree: Float[Tensor, "b n 1"],
+        adjacency: Float[Tensor, "b n n"], eps: float, slope: float,
+    ) -> tuple[Float[Tensor, "b n d"], Float[Tensor, " d"], Float[Tensor, " d"]]:
+        values, own, degree = values.contiguous(), own.contiguous(), degree.contiguous()
+        highest, source, total = _maxima(values, torch.where(weight < 0, -1.0, 1.0), index)
+        rows, width, k, edges = degree.numel(), values.shape[2], index.shape[2], index.numel()
+        grid, sizes = _over_rows(rows, width), {"LINES": LINES, "CHANNELS": CHANNELS}
+        sums = values.new_empty(grid[1], 2, width)
+        _edge_means[grid](values, own, degree, sums, rows, width, **sizes)
+        means = sums.sum(0)
+        means[0] /= edges
+        means[1] /= rows
+        squares = values.new_empty(grid[1], width)
+        _edge_squares[grid](values, own, total, degree, means, squares, rows, width, k, **sizes)
+        mean, variance = means.sum(0), squares.sum(0) / edges
+        root = torch.rsqrt(variance + eps)
+        scale = weight * root
+        shift, out = bias - mean * scale, torch.empty_like(values)
+        _edge_out[grid](highest, own, scale, shift, out, rows, width, SLOPE=slope, **sizes)
+        ctx.save_for_backward(values, own, highest, source, total, degree, adjacency, weight, means, root, scale, shift)
+        ctx.neighbours, ctx.slope, ctx.mixed = k, slope, torch.is_autocast_enabled(values.device.type)
+        ctx.mark_non_differentiable(mean, variance)
+        return out, mean, variance
 
     @staticmethod
     @once_differentiable
     def backward(  # noqa: D102  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *grad_outputs: Float[Tensor, "b n d"]
-    ) -> tuple[Float[Tensor, "b n d"] | None, ...]:
-        source, adjacency = ctx.saved_tensors
-        of_highest, of_total = grad_outputs
-        with torch.autocast(source.device.type, torch.bfloat16, enabled=ctx.mixed):
-            out = torch.zeros_like(of_highest) if adjacency is None else (adjacency.mT @ of_total).float()
-        _, n, width = source.shape
+        ctx: Any, *grad_outputs: Float[Tensor, "..."]
+    ) -> tuple[Float[Tensor, "..."] | None, ...]:
+        values, own, highest, source, total, degree, adjacency, weight, means, root, scale, shift = ctx.saved_tensors
+        grad, (_, n, width), rows, k = grad_outputs[0].contiguous(), values.shape, degree.numel(), ctx.neighbours
+        grid, sizes = _over_rows(rows, width), {"SLOPE": ctx.slope, "LINES": LINES, "CHANNELS": CHANNELS}
+        kind = torch.bfloat16 if ctx.mixed else torch.float32
+        sums, centred = values.new_empty(grid[1], 2, width), torch.empty_like(own, dtype=kind)
+        _edge_slopes[grid](grad, highest, own, scale, shift, means, sums, centred, rows, width, **sizes)
+        plain, scaled = sums.sum(0)
+        by_scale = scaled - means.sum(0) * plain
+        by_mean, by_variance = -scale * plain / (rows * k), -0.5 * by_scale * weight * root**3 / (rows * k)
+        around = adjacency.mT.to(kind) @ centred
+        through, to_own, to_values = torch.empty_like(own), torch.empty_like(own), torch.empty_like(own)
+        _edge_gradients[grid](
+            grad, highest, own, total, values, degree, around, scale, shift, means, by_mean, by_variance, through, to_own,
+            to_values, rows, width, k, **sizes)
         _neighbours_backward[(triton.cdiv(source.numel(), SCATTERED),)](
-            of_highest.contiguous(), source, out, n, width, source.numel(), BLOCK=SCATTERED)
-        return out, None, None, None
+            through, source, to_values, n, width, source.numel(), BLOCK=SCATTERED)
+        return to_values, to_own, by_scale * root, plain, None, None, None, None, None
+
+
+def _over_rows(rows: int, width: int) -> tuple[int, int]:
+    """Programs over channels and over rows."""
+    return triton.cdiv(width, CHANNELS), triton.cdiv(rows, LINES * STEPS.value)
 
 
 def try_out() -> None:
@@ -314,6 +477,6 @@ def try_out() -> None:
     device = torch.device("cuda", torch.cuda.current_device())
     sides, weight = torch.ones(2, 1, 4, 4, device=device), torch.ones(4, 4, device=device)
     pairs = PairLayers.apply(sides, sides, weight, weight[0], weight[0], False)
-    highest, _ = Neighbours.apply(sides[0], weight[0], torch.zeros(1, 4, 1, dtype=torch.int32, device=device), None)
+    highest = highest_neighbours(sides[0], weight[0], torch.zeros(1, 4, 1, dtype=torch.int32, device=device))
     if not bool((pairs == 36).all() & (highest == 1).all()):  # type: ignore[operator]
         raise RuntimeError("a kernel is wrong here")

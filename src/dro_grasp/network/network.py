@@ -112,7 +112,7 @@ class DistanceNetwork(nn.Module):
         super().__init__()
         self.config, self.name = config, name
         self.mixed = False
-        """Whether encoders and transformers multiply in bfloat16, and the kernel of distances in TF32, where a GPU does."""
+        """Whether encoders, transformers and, on a GPU, the kernel of distances multiply in bfloat16; sums have 32 bits."""
         c = config
         self.hand_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
