@@ -7,6 +7,7 @@ hidden layers of pairs, and the values of neighbours. Source: ours.
 # pyright: reportMissingImports=false, reportIndexIssue=false
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import torch
@@ -38,6 +39,8 @@ STEPS = tl.constexpr(8)
 """Tiles that a program sums up. Source: ours."""
 SCATTERED = 1024
 """Gradients that a program adds to neighbours. Source: ours."""
+BACK = {1: 64, 3: 32}
+"""Units of the first hidden layer in the backward pass, by the parts of its products. Source: ours, by registers."""
 SIDE = 64
 """Object points of the backward pass, each with one hand point at a time. Source: ours, timed."""
 COMPARED = 4096
@@ -47,6 +50,8 @@ EXACT = "tf32x3"
 ROUNDED = "bf16"
 """Products of factors with 8 bits, summed in single precision."""
 
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
 
 @triton.jit
 def _product(a, b, total, PRECISION: tl.constexpr):  # type: ignore[no-untyped-def]
@@ -55,6 +60,20 @@ def _product(a, b, total, PRECISION: tl.constexpr):  # type: ignore[no-untyped-d
         result = tl.dot(a.to(tl.bfloat16), b.to(tl.bfloat16), total)
     else:
         result = tl.dot(a, b, total, input_precision=PRECISION)
+    return result
+
+
+@triton.jit
+def _signed_product(s, b, total, PARTS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The sum of total and s b, where s has 0 and 1 alone, and b counts to so many times 8 bits."""
+    if PARTS == 0:  # Triton's interpreter cannot multiply in bfloat16
+        result = tl.dot(s, b, total, input_precision="ieee")
+    else:
+        result = total
+        for _ in tl.static_range(PARTS):
+            part = b.to(tl.bfloat16)
+            result = tl.dot(s.to(tl.bfloat16), part, result)
+            b -= part.to(tl.float32)
     return result
 
 
@@ -120,7 +139,7 @@ def _above(signs, first, place, inside, OUTPUTS: tl.constexpr):  # type: ignore[
 def _pairs_backward(  # type: ignore[no-untyped-def]
     hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, batch, n: tl.constexpr, m: tl.constexpr,
     width: tl.constexpr, outputs: tl.constexpr, SIDE: tl.constexpr, HIDDEN: tl.constexpr, OUTPUTS: tl.constexpr,
-    PRECISION: tl.constexpr,
+    PARTS: tl.constexpr,
 ):
     """Some units of the first layer, for some object points of a sample and one hand point after the other.
 
@@ -141,8 +160,8 @@ def _pairs_backward(  # type: ignore[no-untyped-def]
             x = own + tl.load(hand + (side * n + i) * width + h, mask=h < width, other=0.0)[None, :]
             g = 0.5 * tl.load(grad + (sample * n + i) * m + j, mask=j < m, other=0.0)
             s = _above(signs, side * n * m, i * m + j, j < m, OUTPUTS)
-            share = _product(tl.trans(s), g[:, None] * tl.maximum(x, 0.0), share, PRECISION)
-            to_x = _product(s, w, tl.zeros([SIDE, HIDDEN], tl.float32), PRECISION)
+            share = _signed_product(tl.trans(s), g[:, None] * tl.maximum(x, 0.0), share, PARTS)
+            to_x = _signed_product(s, w, tl.zeros([SIDE, HIDDEN], tl.float32), PARTS)
             to_x = tl.where(x > 0, g[:, None] * to_x, 0.0)
             to_obj += to_x
             tl.atomic_add(grad_hand + (side * n + i) * width + h, tl.sum(to_x, 0), mask=h < width, sem="relaxed")
@@ -182,10 +201,11 @@ class PairLayers(torch.autograd.Function):
         signs = torch.empty(2, b, n, m, padded // 32 if keep else 0, dtype=torch.int32, device=hand.device)
         out = hand.new_empty(b, n, m)
         tiles = triton.cdiv(n, ROWS) * triton.cdiv(m, COLUMNS)
-        ctx.precision = ROUNDED if rounded else EXACT
+        ctx.parts = 1 if rounded else 3
         _pairs_forward[(tiles, b)](
             hand, obj, weight, bias, last, out, signs, b, n, m, width, outputs, ROWS=ROWS, COLUMNS=COLUMNS, HIDDEN=HIDDEN,
-            OUTPUTS=padded, PRECISION=ctx.precision, KEEP=keep, num_warps=WARPS, num_stages=1)
+            OUTPUTS=padded, PRECISION=ROUNDED if rounded and not INTERPRETED else EXACT, KEEP=keep, num_warps=WARPS,
+            num_stages=1)
         ctx.save_for_backward(hand, obj, weight, bias, last, signs)
         return out
 
@@ -200,9 +220,10 @@ class PairLayers(torch.autograd.Function):
         grad_hand, grad_obj = torch.zeros_like(hand), torch.empty_like(obj)
         shares, counts = hand.new_empty(b * parts, outputs, width), hand.new_empty(b, outputs)
         grad, padded = grad_outputs[0].contiguous(), signs.shape[-1] * 32
-        _pairs_backward[(triton.cdiv(width, HIDDEN), parts, b)](
+        hidden = BACK[ctx.parts]
+        _pairs_backward[(triton.cdiv(width, hidden), parts, b)](
             hand, obj, weight, last, grad, signs, grad_hand, grad_obj, shares, b, n, m, width, outputs, SIDE=SIDE,
-            HIDDEN=HIDDEN, OUTPUTS=padded, PRECISION=ctx.precision, num_warps=WARPS, num_stages=1)
+            HIDDEN=hidden, OUTPUTS=padded, PARTS=0 if INTERPRETED else ctx.parts, num_warps=WARPS, num_stages=1)
         _pairs_counts[(b,)](grad, signs, counts, b, n * m, outputs, COUNTED=COUNTED, OUTPUTS=padded)
         share, count = shares.sum(0), counts.sum(0)
         # The second layer is linear where it is above zero, so its mean output follows from the same sums.
