@@ -146,7 +146,7 @@ def _segments(
     """The fields of a hand's row of `Segments`, on the CPU."""
     own, filled = torch.arange(n_links) < len(rows), rows + rows[:1] * (n_links - len(rows))
     links = torch.cat([links, links[:1].expand(n_links - len(links))])
-    index, weight = torch.zeros(2, n_links, n_points, dtype=torch.int64)
+    index, weight = torch.zeros(n_links, n_points, dtype=torch.int64), torch.zeros(n_links, n_points)
     place, kept = torch.zeros(hand.n_points, dtype=torch.int64), torch.zeros(hand.n_points, dtype=torch.bool)
     for i, row in enumerate(filled):
         index[i, : len(row)], weight[i, : len(row)] = row, 1

@@ -116,12 +116,10 @@ def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
     assert found["nats"] > 0
 
 
-class Predicted:
-    """A network that predicts true distances with noise."""
+class Noisy(DistanceNetwork):
+    """Predicts true distances with noise."""
 
-    placement = None
-
-    def __call__(self, hand: Tensor, obj: Tensor, grasp: Tensor, generator: torch.Generator, columns: int) -> NetworkOutput:
+    def forward(self, hand: Tensor, obj: Tensor, grasp: Tensor, generator: torch.Generator, columns: int) -> NetworkOutput:
         distances = torch.cdist(grasp, obj[:, :columns])
         distances = distances + 0.003 * torch.randn(distances.shape, generator=generator)
         return NetworkOutput(distances, torch.zeros(len(hand), 1), torch.zeros(len(hand), 1), torch.zeros(len(hand)), hand)
@@ -135,9 +133,10 @@ def test_losses_of_several_hands_are_those_of_each_by_itself(points: int, links:
     assert source.segments.real.sum(1).tolist() == links
     assert bool(source.segments.kept.all()) == (points == 96)
     groups = [source.draw(hand.name, 3, torch.Generator().manual_seed(i)) for i, hand in enumerate(hands)]
-    found = loop.step_losses(Predicted(), groups, TrainConfig(columns=24), torch.Generator().manual_seed(2))
+    network = Noisy(dataclasses.replace(TINY, frame="object"))
+    found = loop.step_losses(network, groups, TrainConfig(columns=24), torch.Generator().manual_seed(2))
     obj, grasp = (torch.cat([getattr(g, name) for g in groups]) for name in ("obj", "grasp"))
-    output = Predicted()(grasp, obj, grasp, torch.Generator().manual_seed(2), 24)
+    output = network(grasp, obj, grasp, torch.Generator().manual_seed(2), 24)
     poses, depths = [], []
     for group, distances in zip(groups, output.distances.split(3), strict=True):
         links = distance_matrix.decode(group.hand, distances, group.obj[:, :24])

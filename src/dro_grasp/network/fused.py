@@ -51,6 +51,7 @@ ROUNDED = "bf16"
 """Products of factors with 8 bits, summed in single precision."""
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+"""Whether kernels are interpreted on the CPU, as tests do."""
 
 
 @triton.jit

@@ -13,8 +13,10 @@ from torch import Tensor
 
 
 def fused_kernels(values: Float[Tensor, "..."]) -> Any:
-    """The module `network.fused` for single-precision tensors on a CUDA device, if Triton runs there; else None."""
-    return _fused() if values.device.type == "cuda" and values.dtype == torch.float32 else None
+    """The module `network.fused` for single-precision tensors on the current CUDA device, if Triton runs there; else None."""
+    if values.device.type != "cuda" or values.dtype != torch.float32 or values.device.index != torch.cuda.current_device():
+        return None
+    return _fused()
 
 
 @cache

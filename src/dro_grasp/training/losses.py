@@ -16,7 +16,7 @@ def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"
 
 
 def pose_loss(
-    predicted: Float[Tensor, "b l 4 4"], true: Float[Tensor, "b l 4 4"], valid: Bool[Tensor, "*#b l"]
+    predicted: Float[Tensor, "b l 4 4"], true: Float[Tensor, "b l 4 4"], valid: Bool[Tensor, "*#b #l"]
 ) -> Float[Tensor, " b"]:
     """Translation error [m] plus rotation error [rad] of each grasp, mean over its valid links.
 
@@ -33,7 +33,7 @@ def pose_loss(
     return _mean(shift + torch.atan2(sine, cosine), valid)
 
 
-def _mean(values: Float[Tensor, "b n"], valid: Bool[Tensor, "*#b n"]) -> Float[Tensor, " b"]:
+def _mean(values: Float[Tensor, "b n"], valid: Bool[Tensor, "*#b #n"]) -> Float[Tensor, " b"]:
     """Mean of each row over its valid entries, of which it has some."""
     valid = valid.expand_as(values)
     return torch.where(valid, values, 0.0).sum(-1) / valid.sum(-1)
@@ -45,7 +45,7 @@ def _norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
 
 
 def penetration_loss(
-    hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], normals: Float[Tensor, "b m 3"], valid: Bool[Tensor, "*#b n"]
+    hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], normals: Float[Tensor, "b m 3"], valid: Bool[Tensor, "*#b #n"]
 ) -> Float[Tensor, " b"]:
     """Mean penetration of valid hand points into the object [m], by the nearest object point and its outward normal.
 

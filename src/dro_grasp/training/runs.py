@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -352,7 +352,8 @@ class TrainingRun:
                 reports.append(tensorboard_report(self.folder.path))
         self._resume()
         try:
-            with fast_products():
+            device = self.generator.device
+            with fast_products(), torch.cuda.device(device) if device.type == "cuda" else nullcontext():
                 self._steps(losses, reports)
         finally:
             if self._ahead is not None:
