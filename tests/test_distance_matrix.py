@@ -162,3 +162,32 @@ def test_training_can_go_through_the_decoding(cloud: str):
     step = 1e-4 * distances.grad / distances.grad.norm()
     after = (distance_matrix.decode(hand, distances.detach() - step, anchors).T_world_link - wanted).square().sum()
     assert after < before
+
+
+@pytest.mark.parametrize("cloud", ["full", "plane", "mixed"])
+def test_hands_of_several_kinds_are_decoded_together_as_each_by_itself(cloud: str) -> None:
+    hands = [hand.with_points(256) for hand in (toy_hand(), loaded_hand("gripper3"), loaded_hand("allegro"))]
+    rows, count = [], 3
+    for hand in hands:
+        T, q = random_grasps(hand, count)
+        flatness = {"full": [1.0] * 3, "plane": [0.0] * 3, "mixed": [1.0, 0.0, 1.0]}[cloud]
+        obj = torch.stack([ellipsoid(96, seed) * torch.tensor([1.0, 1.0, f]) for seed, f in enumerate(flatness)])
+        noise = 1e-3 * torch.randn(count, hand.n_points, 96, generator=torch.Generator().manual_seed(4))
+        rows.append((distance_matrix.build(hand.points(q, T), obj) + noise, obj))
+    segments = distance_matrix.segments_of(hands, torch.device("cpu"))
+    assert not segments.real.all(), "hands must differ in their numbers of links"
+    distances, obj = (torch.cat(values) for values in zip(*rows, strict=True))
+    each = distance_matrix.together([segments.rows(slice(i, i + 1)).spread(count) for i in range(3)])
+    poses, _, points = distance_matrix.decode_segments(each, distances.requires_grad_(), obj)
+    (gradient,) = torch.autograd.grad((poses * each.real[..., None, None]).square().sum(), distances)
+    on_links = each.poses_of_points(poses)
+    for i, hand in enumerate(hands):
+        own, at = slice(i * count, (i + 1) * count), rows[i][0].requires_grad_()
+        alone = distance_matrix.decode(hand, at, rows[i][1])
+        torch.testing.assert_close(points[own], alone.points)
+        torch.testing.assert_close(poses[own][:, segments.real[i]], alone.T_world_link[:, alone.valid], rtol=1e-4, atol=1e-5)
+        kept = alone.valid[hand.link_index]
+        assert torch.equal(segments.kept[i], kept)
+        torch.testing.assert_close(on_links[own][:, kept], alone.T_world_link[:, hand.link_index[kept]], rtol=1e-4, atol=1e-5)
+        (known,) = torch.autograd.grad(alone.T_world_link[:, alone.valid].square().sum(), at)
+        assert float((gradient[own] - known).abs().max()) < 1e-3 * float(known.abs().max())

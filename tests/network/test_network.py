@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from dro_grasp import devices
 from dro_grasp.devices import fast_products
-from dro_grasp.network.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
+from dro_grasp.network.encoder import SLOPE, EdgeLayer, Graph, StaticGraphEncoder, nearest_neighbours
 from dro_grasp.network.latent import FlowPrior
 from dro_grasp.network.network import Attention, DistanceNetwork, untrained_network
 from dro_grasp.network.presets import NetworkConfig
@@ -50,7 +50,7 @@ def test_edge_layer_equals_its_plain_form_in_training(
     layer, norm, x, index = edge_case
     x.requires_grad_()
     weight = torch.randn(3, 30, 12)
-    fast, slow = layer(x, index), plain_edge_layer(layer, norm, x, index)
+    fast, slow = layer(x, Graph(index)), plain_edge_layer(layer, norm, x, index)
     torch.testing.assert_close(fast, slow, rtol=1e-4, atol=1e-5)
     ours = torch.autograd.grad((fast * weight).sum(), [x, layer.linear.weight, layer.norm.weight, layer.norm.bias])
     theirs = torch.autograd.grad((slow * weight).sum(), [x, layer.linear.weight, norm.weight, norm.bias])
@@ -65,12 +65,12 @@ def test_edge_layer_keeps_the_statistics_of_batch_norm(
     layer, norm, x, index = edge_case
     layer.norm.momentum = norm.momentum = momentum
     for step in range(3):
-        layer(x * (step + 1), index)
+        layer(x * (step + 1), Graph(index))
         plain_edge_layer(layer, norm, x * (step + 1), index)
     torch.testing.assert_close(layer.norm.running_mean, norm.running_mean, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(layer.norm.running_var, norm.running_var, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(
-        layer.eval()(x, index), plain_edge_layer(layer, norm.eval(), x, index), rtol=1e-4, atol=1e-5
+        layer.eval()(x, Graph(index)), plain_edge_layer(layer, norm.eval(), x, index), rtol=1e-4, atol=1e-5
     )
 
 
@@ -81,7 +81,7 @@ def test_statistics_do_not_lose_digits_far_from_zero() -> None:
     double = EdgeLayer(3, 4).double()
     double.load_state_dict(layer.state_dict())
     exact = plain_edge_layer(double, norm.double(), x.double(), index)
-    torch.testing.assert_close(layer(x, index), exact.float(), rtol=1e-3, atol=2e-3)
+    torch.testing.assert_close(layer(x, Graph(index)), exact.float(), rtol=1e-3, atol=2e-3)
 
 
 def test_nearest_neighbours_are_the_nearest() -> None:

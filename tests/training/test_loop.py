@@ -8,19 +8,22 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from dro_grasp import distance_matrix
 from dro_grasp.errors import TrainingError
-from dro_grasp.network.network import DistanceNetwork
+from dro_grasp.network.network import DistanceNetwork, NetworkOutput
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
-from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.data.bundle.training_file import Bundle, write_bundle
 from dro_grasp.training.loop import measure_hands, train
 from dro_grasp.training.measures import matching_rank
 from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.training.runs import recalibrate
 from dro_grasp.training.samples import SampleSource
-from tests.helpers.tiny_bundle import TINY
+from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.tiny_bundle import TINY, ellipsoid, made_up_grasps
+from tests.helpers.toy_hand import toy_hand
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
 
 
@@ -111,6 +114,44 @@ def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
     found = {name: float(value.detach()) for name, value in values.items()}
     assert found["total"] == pytest.approx(sum(getattr(weights, n) * v for n, v in found.items() if n not in {"total", "nats"}))
     assert found["nats"] > 0
+
+
+class Noisy(DistanceNetwork):
+    """Predicts true distances with noise."""
+
+    def forward(self, hand: Tensor, obj: Tensor, grasp: Tensor, generator: torch.Generator, columns: int) -> NetworkOutput:
+        distances = torch.cdist(grasp, obj[:, :columns])
+        distances = distances + 0.003 * torch.randn(distances.shape, generator=generator)
+        return NetworkOutput(distances, torch.zeros(len(hand), 1), torch.zeros(len(hand), 1), torch.zeros(len(hand)), hand)
+
+
+@pytest.mark.parametrize(("points", "links"), [(48, [7, 1]), (96, [7, 21])], ids=["points that have no link", "padded links"])
+def test_losses_of_several_hands_are_those_of_each_by_itself(points: int, links: list[int], tmp_path: Path) -> None:
+    hands, clouds = [toy_hand(), loaded_hand("allegro")], {"egg": ellipsoid((0.12, 0.1, 0.11))}
+    both = write_bundle(tmp_path / "b.safetensors", hands, clouds, [made_up_grasps(hand, "egg") for hand in hands])
+    source = SampleSource(both, dataclasses.replace(TINY, n_hand=points), AugmentationConfig())
+    assert source.segments.real.sum(1).tolist() == links
+    assert bool(source.segments.kept.all()) == (points == 96)
+    groups = [source.draw(hand.name, 3, torch.Generator().manual_seed(i)) for i, hand in enumerate(hands)]
+    network = Noisy(dataclasses.replace(TINY, frame="object"))
+    found = loop.step_losses(network, groups, TrainConfig(columns=24), torch.Generator().manual_seed(2))
+    obj, grasp = (torch.cat([getattr(g, name) for g in groups]) for name in ("obj", "grasp"))
+    output = network(grasp, obj, grasp, torch.Generator().manual_seed(2), 24)
+    poses, depths = [], []
+    for group, distances in zip(groups, output.distances.split(3), strict=True):
+        links = distance_matrix.decode(group.hand, distances, group.obj[:, :24])
+        turns, true = links.T_world_link[:, links.valid], group.T_frame_link[:, links.valid]
+        trace = (turns[..., :3, :3] * true[..., :3, :3]).sum((-2, -1))
+        poses.append((((trace - 1) / 2).clamp(-1, 1).acos() + (turns - true)[..., :3, 3].norm(dim=-1)).mean(1))
+        kept = links.valid[group.hand.link_index]
+        posed = group.hand.link_points[kept, None] @ links.T_world_link[:, group.hand.link_index[kept], :3, :3].mT
+        posed = posed[:, :, 0] + links.T_world_link[:, group.hand.link_index[kept], :3, 3]
+        nearest = torch.cdist(posed, group.obj).argmin(-1)
+        rows = torch.arange(3)[:, None]
+        depths.append((-((posed - group.obj[rows, nearest]) * group.normals[rows, nearest]).sum(-1)).clamp(min=0).mean(1))
+    assert min(float(each.max()) for each in depths) > 0
+    assert float(found["pose"]) == pytest.approx(float(torch.cat(poses).mean()), rel=1e-4)
+    assert float(found["penetration"]) == pytest.approx(float(torch.cat(depths).mean()), rel=1e-4)
 
 
 def test_prior_and_motion_learn(bundle: Bundle) -> None:

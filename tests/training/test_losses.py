@@ -21,6 +21,8 @@ from dro_grasp.training.losses import (
     pose_loss,
 )
 
+ALL = torch.tensor([True])
+
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
@@ -75,8 +77,8 @@ def test_penetration_of_a_sphere_is_the_mean_depth() -> None:
     radii = torch.tensor([0.03, 0.045, 0.049, 0.051, 0.07])
     hand = torch.nn.functional.normalize(torch.randn(1, 5, 3), dim=-1) * radii[:, None]
     expected = float((0.05 - radii).clamp(min=0).mean())
-    assert float(penetration_loss(hand, obj, normals)) == pytest.approx(expected, abs=2e-5)  # [m]
-    assert float(penetration_loss(hand * 3, obj, normals)) == 0
+    assert float(penetration_loss(hand, obj, normals, ALL)) == pytest.approx(expected, abs=2e-5)  # [m]
+    assert float(penetration_loss(hand * 3, obj, normals, ALL)) == 0
 
 
 def test_penetration_equals_a_loop() -> None:
@@ -89,7 +91,7 @@ def test_penetration_equals_a_loop() -> None:
             j = int((obj[b] - point).norm(dim=-1).argmin())
             depth += max(0.0, -float((point - obj[b, j]) @ normals[b, j]))
         expected.append(depth / 7)
-    np.testing.assert_allclose(penetration_loss(hand, obj, normals), expected, rtol=1e-5)
+    np.testing.assert_allclose(penetration_loss(hand, obj, normals, ALL), expected, rtol=1e-5)
 
 
 def test_divergence_equals_pytorchs() -> None:
@@ -143,7 +145,7 @@ def test_gradients_equal_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda T: pose_loss(T, true, torch.ones(2, dtype=torch.bool)), [moved])
     obj, normals = torch.randn(2, 1, 9, 3, **double)
     hand = torch.randn(1, 5, 3, **double, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: penetration_loss(x, obj, normals), [hand])
+    assert torch.autograd.gradcheck(lambda x: penetration_loss(x, obj, normals, ALL), [hand])
     a, b = (torch.randn(1, 5, 4, **double, requires_grad=True) for _ in range(2))
     p = torch.randn(1, 5, 3, **double)
     assert torch.autograd.gradcheck(lambda x, y: contrastive_loss(x, y, p, 0.5, 2.0), [a, b])

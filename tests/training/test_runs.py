@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +24,7 @@ from torch import nn
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.network.network import DistanceNetwork, untrained_network
-from dro_grasp.training import loop, losses, pretraining
+from dro_grasp.training import loop, losses, pretraining, runs
 from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
 from dro_grasp.training.runs import (
@@ -37,6 +38,7 @@ from dro_grasp.training.runs import (
     learning_rate_share,
     run_plan,
 )
+from dro_grasp.training.samples import SampleSource
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
 
@@ -380,6 +382,28 @@ def test_every_shard_of_every_step_and_seed_draws_numbers_of_its_own(tmp_path: P
     drawn = [draw(*place) for place in places]
     assert len(set(drawn)) == len(places)
     assert drawn == [draw(*place) for place in places]
+
+
+@pytest.mark.parametrize("schedule", [SCHEDULE, SHARDED], ids=["one shard", "two shards"])
+def test_samples_drawn_ahead_in_a_thread_give_the_same_curve(
+    schedule: ScheduleConfig, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_stage("train", bundle, tmp_path / "in turn", schedule)
+    drawn, draw = [], SampleSource.draw
+    monkeypatch.setattr(runs, "draws_ahead", lambda _: True)
+    monkeypatch.setattr(SampleSource, "draw", lambda *values: drawn.append(threading.current_thread()) or draw(*values))
+    run_stage("train", bundle, tmp_path / "ahead", schedule)
+    assert curve(tmp_path / "ahead") == curve(tmp_path / "in turn")
+    steps = schedule.steps * schedule.shards
+    assert sum(thread is not threading.main_thread() for thread in drawn) in {steps, steps + 1}, "the last is not needed"
+    assert not any(thread.is_alive() for thread in drawn if thread is not threading.main_thread())
+
+
+def test_a_fault_of_the_thread_that_draws_is_told(bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "draws_ahead", lambda _: True)
+    monkeypatch.setattr(SampleSource, "draw", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_stage("train", bundle, tmp_path / "run")
 
 
 def test_shards_that_cannot_be_shared_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,7 +151,7 @@ class Train(Stage):
     by_count: float = 0.0
     """Power of the number of grasps with which hands are drawn; 0 draws all hands equally often."""
     columns: int = 48  # Object points to which a step predicts distances; a GPU affords 128.
-    mixed: Flag = False  # Multiply in bfloat16 in encoders and transformers; for GPUs.
+    mixed: Flag = False  # Multiply in bfloat16; for GPUs.
     partial: float = 0.0  # Share of samples with half of the object cut away.
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
     """Bundle of grasps that are not trained on. The distance errors on them are reported at the end."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import at_once
@@ -64,8 +64,7 @@ def multilaterate(
         height = _height(plain, distances, cloud)[..., None] * normal
         # The closed form carries a large error along the thin axis; the height comes from the distances alone.
         level = plain - (plain * normal).sum(-1, keepdim=True) * normal
-        sides = [_refine_where(flat, level + sign * height, distances, cloud, config) for sign in (1.0, -1.0)]
-        both = torch.where(flat[..., None, None, None], torch.stack(sides, -3), both)
+        both = _refine_where(flat, torch.stack([level + height, level - height], -3), both, distances, cloud, config)
     return both + cloud.centre[..., None, :, :], flat
 
 
@@ -108,17 +107,17 @@ def _height(start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], 
 
 
 def _refine_where(
-    chosen: Bool[Tensor, "*b"], start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud,
-    config: MultilaterationConfig,
-) -> Float[Tensor, "*b n 3"]:
-    """Refine the chosen clouds of the batch and leave the others."""
+    chosen: Bool[Tensor, "*b"], start: Float[Tensor, "*b 2 n 3"], otherwise: Float[Tensor, "*b 2 n 3"],
+    distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig,
+) -> Float[Tensor, "*b 2 n 3"]:
+    """Refine the chosen clouds of the batch from both sides, and leave the others."""
     shape, n, m = start.shape, start.shape[-2], cloud.points.shape[-2]
     rows = chosen.reshape(-1).nonzero()[:, 0]
-    start, distances = start.reshape(-1, n, 3), distances.reshape(-1, n, m)
-    anchors = cloud.points.reshape(-1, m, 3)
-    size = at_once(start.device, ON_CPU, COPIES * n * m * start.element_size(), config.chunk)
+    start, distances = start.reshape(-1, 2, n, 3), distances.reshape(-1, 1, n, m)
+    anchors = cloud.points.reshape(-1, 1, m, 3)
+    size = at_once(start.device, ON_CPU, 2 * COPIES * n * m * start.element_size(), config.chunk)
     parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(size)]
-    return start.index_put((rows,), torch.cat(parts)).reshape(shape)
+    return otherwise.reshape(-1, 2, n, 3).index_put((rows,), torch.cat(parts)).reshape(shape)
 
 
 def _refine(
@@ -145,7 +144,7 @@ def _step(
     with torch.no_grad():
         matrix = _outer_products(points, current.square().reciprocal(), anchors)
         matrix = matrix + config.damping * anchors.shape[-2] * torch.eye(3, dtype=points.dtype, device=points.device)
-        inverse = torch.linalg.inv(matrix)
+        inverse = torch.linalg.inv_ex(matrix).inverse  # which does not wait for a GPU; the damping keeps it regular
     pull = 1 - distances / current
     gradient = points * pull.sum(-1, keepdim=True) - pull @ anchors
     step = -(inverse @ gradient[..., None])[..., 0]
@@ -185,8 +184,8 @@ class SideConfig(Checked):
 
 @torch.no_grad()
 def choose_sides(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], reference: int, config: SideConfig | None = None,
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    misfit: Float[Tensor, "b 2 l p"], reference: int | Int[Tensor, " b"], config: SideConfig | None = None,
 ) -> Bool[Tensor, "b l p"]:
     """Whether each point takes its second candidate.
 
@@ -195,32 +194,34 @@ def choose_sides(
     the other, and the two ways in which the plane may cut it. From each start, points pick their nearer candidates and the body
     is registered again; the smallest error wins, on the `reference` body's side if both sides fit alike.
 
-    Points of l bodies are in their own frames [m], with weight 0 for padding; misfits at their candidates [m^2] are mean
-    squares.
+    Points of l bodies, the same for all clouds or of each, are in their own frames [m], with weight 0 for padding; misfits at
+    their candidates [m^2] are mean squares.
     """
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)
     starts = (torch.zeros_like(cut), torch.ones_like(cut), cut, ~cut)
-    results = [_settle(local, weight, candidates, misfit, start, config) for start in starts]
-    picks, errors = torch.stack([r[0] for r in results], 1), torch.stack([r[1] for r in results], 1)
+    weight = weight.expand(len(candidates), -1, -1)[:, None]
+    local = local.expand(len(candidates), -1, -1, -1)
+    picks, errors = _settle(local, weight, candidates, misfit, torch.stack(starts, 1), config)
     mostly_second = (picks * weight).sum(-1) > 0.5 * weight.sum(-1)
-    best = errors[..., reference].argmin(1)
-    side = mostly_second[..., reference].gather(1, best[:, None])
+    reference = torch.as_tensor(reference, device=errors.device).expand(len(errors))[:, None, None].expand(-1, len(starts), 1)
+    best = errors.gather(2, reference)[..., 0].argmin(1)
+    side = mostly_second.gather(2, reference)[..., 0].gather(1, best[:, None])
     agrees = mostly_second == side[..., None]
     best = torch.where(agrees, errors * config.reference_margin, errors).argmin(1)
     return picks.gather(1, best[:, None, :, None].expand(-1, 1, -1, picks.shape[-1]))[:, 0]
 
 
 def _cut(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], height: Float[Tensor, "b l p"], config: SideConfig
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], height: Float[Tensor, "b l p"], config: SideConfig
 ) -> Bool[Tensor, "b l p"]:
     """Side of the plane for each point of each body, up to exchanging the sides."""
     # A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So h^2 = (x,
     # 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives them, and a is
     # the leading eigenvector.
-    count = weight.sum(-1)[:, None, None]
-    centred = local - (local * weight[..., None]).sum(1, keepdim=True) / count
-    size = ((centred.square() * weight[..., None]).sum((1, 2), keepdim=True) / count).sqrt().clamp(min=1e-6)
+    count = weight.sum(-1)[..., None, None]
+    centred = local - (local * weight[..., None]).sum(-2, keepdim=True) / count
+    size = ((centred.square() * weight[..., None]).sum((-2, -1), keepdim=True) / count).sqrt().clamp(min=1e-6)
     x = torch.cat([centred / size, torch.ones_like(local[..., :1])], -1)
     rows, columns = torch.triu_indices(4, 4, device=local.device)
     products = x[..., rows] * x[..., columns] * (2 - (rows == columns).to(x)) * weight[..., None]
@@ -235,17 +236,16 @@ def _cut(
 
 
 def _settle(
-    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b l p"], config: SideConfig,
-) -> tuple[Bool[Tensor, "b l p"], Float[Tensor, "b l"]]:
-    """Alternate between picking and registering; returns the picks and each body's mean squared error [m^2]."""
-    local = local.expand(len(candidates), -1, -1, -1)
-    weight = weight.expand(len(candidates), -1, -1)
-    away = misfit
+    local: Float[Tensor, "b l p 3"], weight: Float[Tensor, "b 1 l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b s l p"], config: SideConfig,
+) -> tuple[Bool[Tensor, "b s l p"], Float[Tensor, "b s l"]]:
+    """Alternate between picking and registering from each start; returns the picks and each body's mean squared error [m^2]."""
+    local, weight = local[:, None].expand(*second.shape, 3), weight.expand(second.shape)
+    away = misfit[:, None]
     for _ in range(config.rounds):
-        points = torch.where(second[..., None], candidates[:, 1], candidates[:, 0])
+        points = torch.where(second[..., None], candidates[:, None, 1], candidates[:, None, 0])
         T, _ = register(local, points, weight)
         posed = apply_to_cloud(T, local)
-        away = (candidates - posed[:, None]).square().sum(-1) + misfit
-        second = away[:, 1] < away[:, 0]
-    return second, (away.amin(1) * weight).sum(-1) / weight.sum(-1)
+        away = (candidates[:, None] - posed[:, :, None]).square().sum(-1) + misfit[:, None]
+        second = away[:, :, 1] < away[:, :, 0]
+    return second, (away.amin(2) * weight).sum(-1) / weight.sum(-1)

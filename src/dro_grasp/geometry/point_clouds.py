@@ -16,6 +16,8 @@ until each cell has one point never end on points that coincide."""
 
 def point_distances(a: Float[Tensor, "*#b n 3"], b: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*#b n m"]:
     """Distance of each point of one cloud to each of another [m], as their coordinates give it."""
+    if a.is_cuda:  # whose kernel takes a block of threads for each distance
+        return (a[..., :, None, :] - b[..., None, :, :]).norm(dim=-1)
     # PyTorch's form by a matrix product loses half of the digits, and its gradient is not finite where points meet.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 

@@ -33,20 +33,6 @@ Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True)
-class Segments:
-    """The points of each registrable link, padded to one length."""
-
-    links: Int[Tensor, " l"]
-    index: Int[Tensor, "l p"]  # rows of the hand's surface points; 0 where padded
-    weight: Float[Tensor, "l p"]  # 1, or 0 where padded
-    local: Float[Tensor, "l p 3"]  # the points in their link's frame [m]
-
-    def to(self, like: Float[Tensor, "..."]) -> Segments:
-        """The same on the device, and in the precision, of a tensor."""
-        return Segments(self.links.to(like.device), self.index.to(like.device), self.weight.to(like), self.local.to(like))
-
-
-@dataclass(frozen=True)
 class Hand:
     """A hand and everything that was derived from its description."""
 
@@ -162,16 +148,6 @@ class Hand:
         """Indices of the fingers that have surface points."""
         found = self.finger_of_link[self.link_index].unique()
         return found[found != PALM]
-
-    @cached_tensor
-    def segments(self) -> Segments:
-        """The surface points of each registrable link."""
-        links = self.registrable.nonzero()[:, 0]
-        rows = [(self.link_index == link).nonzero()[:, 0] for link in links]
-        index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
-        lengths = torch.tensor([len(row) for row in rows], device=index.device)
-        weight = (torch.arange(index.shape[1], device=index.device) < lengths[:, None]).to(self.link_points)
-        return Segments(links, index, weight, self.link_points[index])
 
     @cached_tensor
     def finger_links(self) -> Bool[Tensor, "n_tips n_links"]:

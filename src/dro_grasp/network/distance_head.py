@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from dro_grasp.network.kernels import fused_kernels
+
 threshold_backward = torch.ops.aten.threshold_backward
 PAIRS_PER_CHUNK = {"cpu": 2048, "cuda": 1 << 19}
 """Pairs of points whose hidden layers exist at a time, by kind of device; others count as cuda. Source: ours, timed."""
@@ -36,15 +38,20 @@ class DistanceHead(nn.Module):
             self.last.bias.fill_(float(inverse_softplus(torch.tensor(initial_distance, device="cpu"))))
 
     def forward(
-        self, hand: Float[Tensor, "b n width"], obj: Float[Tensor, "b m width"], base: Float[Tensor, "b n m"] | None = None
+        self, hand: Float[Tensor, "b n width"], obj: Float[Tensor, "b m width"], base: Float[Tensor, "b n m"] | None = None,
+        rounded: bool = False,
     ) -> Float[Tensor, "b n m"]:
-        """Distances [m], from features of the points with z, and from distances that the kernel corrects, if any [m]."""
+        """Distances [m], from features of the points with z, and from distances that the kernel corrects, if any [m].
+
+        `rounded` lets a GPU multiply in bfloat16; sums have 32 bits.
+        """
         left, right = self.first.weight.chunk(2, 1)
         both = torch.cat([left, right])
         hand_sides = _sides(hand @ both.T)
         object_sides = _sides(obj @ both.T + self.first.bias.repeat(2)).flip(0)
-        pairs: Tensor = _PairLayers.apply(  # type: ignore[assignment]
-            hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0])
+        values = hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0]
+        fused = fused_kernels(hand_sides)
+        pairs: Tensor = fused.PairLayers.apply(*values, rounded) if fused else _PairLayers.apply(*values)  # type: ignore[assignment]
         logits = pairs + self.last.bias
         if base is not None:
             offset = inverse_softplus(torch.tensor(self.initial_distance)).to(base)

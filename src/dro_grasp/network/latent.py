@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dro_grasp.network.encoder import SLOPE, EdgeLayer, PointLayer, nearest_neighbours
+from dro_grasp.network.encoder import SLOPE, EdgeLayer, Graph, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0  # Log-variances of z are clamped to plus and minus this. Source: ours
 CERTAIN = -4.0  # Log-variance of the posterior of an untrained motion code. Source: ours
@@ -29,10 +29,10 @@ class LatentEncoder(nn.Module):
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"]
     ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
         """Mean and log-variance of the posterior."""
-        index = nearest_neighbours(points, self.neighbours)
+        graph = Graph(nearest_neighbours(points, self.neighbours))
         x, kept = torch.cat([points, features], -1), []
         for layer in self.layers:
-            x = layer(x, index)
+            x = layer(x, graph)
             kept.append(x)
         x = self.final(torch.cat(kept, -1))
         mean, log_variance = self.head(torch.cat([x.amax(1), x.mean(1)], -1)).chunk(2, -1)

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from dro_grasp.devices import fast_products
 from dro_grasp.errors import WeightsError
+from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.network import latent
 from dro_grasp.network.distance_head import DistanceHead
 from dro_grasp.network.encoder import StaticGraphEncoder
@@ -72,8 +73,6 @@ class CrossTransformer(nn.Module):
         return self.norms[6](self.norms[5](x + self.forward_layer(x)))
 
 
-EXACT = "donot_use_mm_for_euclid_dist"
-"""Mode of `torch.cdist` for the placed hand's distances: the matrix-product form loses half of the digits."""
 PLACE_SCALE = 10.0
 """Factor of the placed hand's coordinates, a tenth of a metre large, at the network's input [1/m]. Source: ours."""
 
@@ -113,7 +112,7 @@ class DistanceNetwork(nn.Module):
         super().__init__()
         self.config, self.name = config, name
         self.mixed = False
-        """Whether encoders and transformers multiply in bfloat16; distances are always computed in single precision."""
+        """Whether encoders, transformers and, on a GPU, the kernel of distances multiply in bfloat16; sums have 32 bits."""
         c = config
         self.hand_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
@@ -222,9 +221,9 @@ class DistanceNetwork(nn.Module):
         self, psi_hand: Float[Tensor, "b n width"], psi_object: Float[Tensor, "b m width"], z: Float[Tensor, "b latent"],
         hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b n m"]:
-        base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
+        base = point_distances(hand, obj) if self.config.placed else None
         with_z = (torch.cat([psi, z[:, None].expand(-1, psi.shape[1], -1)], -1) for psi in (psi_hand, psi_object))
-        return self.head(*with_z, base)
+        return self.head(*with_z, base, self.mixed)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]

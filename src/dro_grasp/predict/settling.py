@@ -214,8 +214,9 @@ def settle_all(
     config = config or SettleConfig()
     whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
         problems, batches, strict=True)]
-    first = [None if problem.lies_flat else settle(problem.hand, problem.solid, grasps, config.closing, device=str(problem.device))
-             for problem, grasps in zip(problems, whole, strict=True)]
+    first = [None if problem.lies_flat else settle(
+        problem.hand, problem.solid, grasps, config.closing, device=str(problem.device))
+        for problem, grasps in zip(problems, whole, strict=True)]
     hanging = [i for i, closed in enumerate(first) if closed is not None]
     closed = [_Closed.of(problems[i], whole[i], first[i], config) for i in hanging]
     better = dict(zip(hanging, _bettered([problems[i] for i in hanging], closed, config), strict=True))

@@ -85,7 +85,7 @@ class ScheduleConfig(Checked):
     tensorboard: bool = False
     """Also write the log for TensorBoard, which must be installed."""
     mixed: bool = False
-    """Multiply in bfloat16 in encoders and transformers: faster on hardware that supports it."""
+    """Multiply in bfloat16: in encoders and transformers, and on a GPU in the kernel of distances."""
     device: str = "cpu"
     """Device of network and samples: `cpu`, `cuda`, `cuda:1`. Another kind of device draws other samples."""
     seed: int = 0

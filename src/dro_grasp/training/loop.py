@@ -5,6 +5,7 @@ Source: paper section III-E; the prior is ours.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -69,13 +70,10 @@ def train(
         # train() would put the frozen encoder's BatchNorm back into training mode.
         model.hand_encoder.eval()
 
-    def draw() -> list[HandSamples]:
-        names = source.draw_hands(config.hands_per_step, generator, config.by_count)
-        return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-
-    run.train(lambda: step_losses(model, draw(), config, generator), report or console_report("training"))
+    draw = _drawing(source, config)
+    run.train(lambda: step_losses(model, run.drawn(draw), config, generator), report or console_report("training"))
     run.seed_shard()
-    recalibrate(model, lambda: model(*_clouds(draw()), generator, columns=1), config.schedule.recalibration)
+    recalibrate(model, lambda: model(*_clouds(draw(generator)), generator, columns=1), config.schedule.recalibration)
     model.mixed = False
     return model.cpu().eval()
 
@@ -88,18 +86,13 @@ def step_losses(
     output = model(placed, obj, grasp, generator, columns=config.columns)
     anchors = obj[:, : config.columns]
     parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
-    poses, penetrations = [], []
-    start = 0
-    for group in groups:
-        rows = slice(start, start + len(group.placed))
-        links = distance_matrix.decode(group.hand, output.distances[rows], anchors[rows])
-        poses.append(losses.pose_loss(links.T_world_link, group.T_frame_link, links.valid))
-        kept = links.valid[group.hand.link_index]
-        posed = apply(links.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
-        penetrations.append(losses.penetration_loss(posed, group.obj, group.normals))
-        start = rows.stop
-    parts["pose"] = torch.cat(poses).mean()
-    parts["penetration"] = torch.cat(penetrations).mean()
+    segments = distance_matrix.together([group.segments for group in groups])
+    T, _, _ = distance_matrix.decode_segments(segments, output.distances, anchors)
+    true = torch.cat([group.T_frame_link[:, group.segments.links[0]] for group in groups])
+    parts["pose"] = losses.pose_loss(T, true, segments.real).mean()
+    local = torch.cat([group.hand.link_points.expand(len(group.placed), -1, -1) for group in groups])
+    posed, normals = apply(segments.poses_of_points(T), local), torch.cat([group.normals for group in groups])
+    parts["penetration"] = losses.penetration_loss(posed, obj, normals, segments.kept).mean()
     nats = losses.divergence(output.mean, output.log_variance)
     parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form)
     if model.placement is not None:
@@ -109,6 +102,14 @@ def step_losses(
     weights = {name: getattr(config.losses, name) for name in parts}
     total = torch.stack([weights[name] * value for name, value in parts.items()]).sum()
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
+
+
+def _drawing(
+    source: SampleSource, config: TrainConfig | PlacementConfig
+) -> Callable[[torch.Generator], list[HandSamples]]:
+    """What draws the samples of a shard."""
+    return lambda generator: source.draw_all(
+        source.draw_hands(config.hands_per_step, generator, config.by_count), config.samples_per_hand, generator)
 
 
 def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
@@ -133,10 +134,10 @@ def train_placement(
     plan = run_plan(config, bundle, network, initial=initial)
     run = TrainingRun(folder, prior, config.schedule, generator, processes, plan)
 
+    draw = _drawing(source, config)
+
     def step() -> Losses:
-        names = source.draw_hands(config.hands_per_step, generator, config.by_count)
-        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-        return placement_losses(prior, groups, config.augmentation.proportions, generator)
+        return placement_losses(prior, run.drawn(draw), config.augmentation.proportions, generator)
 
     run.train(step, report or console_report("placement"))
     return model.cpu().eval()

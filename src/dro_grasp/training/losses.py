@@ -16,9 +16,9 @@ def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"
 
 
 def pose_loss(
-    predicted: Float[Tensor, "b l 4 4"], true: Float[Tensor, "b l 4 4"], valid: Bool[Tensor, " l"]
+    predicted: Float[Tensor, "b l 4 4"], true: Float[Tensor, "b l 4 4"], valid: Bool[Tensor, "*#b #l"]
 ) -> Float[Tensor, " b"]:
-    """Translation error [m] plus rotation error [rad] of each grasp, mean over its links with a pose of their own.
+    """Translation error [m] plus rotation error [rad] of each grasp, mean over its valid links.
 
     Differs from the paper: the angle is computed by atan2 instead of arccos, whose slope is infinite at zero error.
     Source: paper section III-E.
@@ -30,8 +30,13 @@ def pose_loss(
         relative[..., 1, 0] - relative[..., 0, 1],
     ], -1))
     cosine = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
-    error = shift + torch.atan2(sine, cosine)
-    return error[:, valid].mean(1)
+    return _mean(shift + torch.atan2(sine, cosine), valid)
+
+
+def _mean(values: Float[Tensor, "b n"], valid: Bool[Tensor, "*#b #n"]) -> Float[Tensor, " b"]:
+    """Mean of each row over its valid entries, of which it has some."""
+    valid = valid.expand_as(values)
+    return torch.where(valid, values, 0.0).sum(-1) / valid.sum(-1)
 
 
 def _norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -40,9 +45,9 @@ def _norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
 
 
 def penetration_loss(
-    hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], normals: Float[Tensor, "b m 3"]
+    hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], normals: Float[Tensor, "b m 3"], valid: Bool[Tensor, "*#b #n"]
 ) -> Float[Tensor, " b"]:
-    """Mean penetration of hand points into the object [m], by the nearest object point and its outward normal.
+    """Mean penetration of valid hand points into the object [m], by the nearest object point and its outward normal.
 
     Differs from the paper: a mean instead of a sum, so that the weight does not depend on the number of points.
     Source: paper section III-E.
@@ -50,7 +55,7 @@ def penetration_loss(
     with torch.no_grad():
         nearest = torch.cdist(hand, obj).argmin(-1)[..., None].expand(-1, -1, 3)
     signed = ((hand - obj.gather(1, nearest)) * normals.gather(1, nearest)).sum(-1)
-    return functional.relu(-signed).mean(-1)
+    return _mean(functional.relu(-signed), valid)
 
 
 def divergence(mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:

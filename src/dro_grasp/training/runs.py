@@ -9,15 +9,17 @@ import math
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, distributed, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -254,6 +256,48 @@ def process_count() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
+class Ahead:
+    """Draws the samples of the next shard in a thread, on a stream of its own, while a GPU computes the losses of this one."""
+
+    def __init__(self, generator: torch.Generator, kept: int) -> None:
+        """Make ready; `generator` goes on as if it had drawn the samples. The GPU is waited for every `kept` shards."""
+        self.generator, device = generator, generator.device
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        if self._stream is not None:
+            self._stream.wait_stream(torch.cuda.current_stream(device))
+        self._thread = ThreadPoolExecutor(1)
+        self._begun: dict[int, Future[tuple[Any, Int[Tensor, " state"], Any]]] = {}
+        # The stream's memory may be used again only once the losses have been computed.
+        self._kept: deque[Any] = deque(maxlen=kept)
+
+    def take(self, draw: Callable[[torch.Generator], Any], seed: int, following: int) -> Any:
+        """The samples of a seed; those of the following one are begun."""
+        samples, state, done = (self._begun.pop(seed, None) or self._thread.submit(self._drawn, draw, seed)).result()
+        self._begun = {following: self._thread.submit(self._drawn, draw, following)}
+        self.generator.set_state(state)
+        if done is not None:
+            torch.cuda.current_stream(self.generator.device).wait_event(done)
+        self._kept.append(samples)
+        return samples
+
+    def _drawn(self, draw: Callable[[torch.Generator], Any], seed: int) -> tuple[Any, Int[Tensor, " state"], Any]:
+        generator = torch.Generator(self.generator.device)
+        generator.manual_seed(seed)
+        if self._stream is None:
+            return draw(generator), generator.get_state(), None
+        with torch.cuda.device(generator.device), torch.cuda.stream(self._stream):
+            return draw(generator), generator.get_state(), self._stream.record_event()
+
+    def close(self) -> None:
+        """End the thread; what it has begun is not needed."""
+        self._thread.shutdown(cancel_futures=True)
+
+
+def draws_ahead(device: torch.device) -> bool:
+    """Whether samples are drawn in a thread: where the processor has time for it, beside a GPU."""
+    return device.type == "cuda"
+
+
 Losses = dict[str, Float[Tensor, ""]]  # Losses of a batch by name; `total` is minimised
 
 
@@ -285,6 +329,8 @@ class TrainingRun:
         self.step = 0
         self.seconds = 0.0  # spent training, over all sittings [s]
         self._clock = 0.0  # when time was last added [s]
+        self._shard, self._ahead = 0, None if not draws_ahead(generator.device) else Ahead(
+            generator, -(-schedule.shards // self.processes.count))
 
     @property
     def progress(self) -> float:
@@ -307,14 +353,32 @@ class TrainingRun:
             if self.schedule.tensorboard:
                 reports.append(tensorboard_report(self.folder.path))
         self._resume()
-        with fast_products():
-            self._steps(losses, reports)
+        try:
+            device = self.generator.device
+            with fast_products(), torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+                self._steps(losses, reports)
+        finally:
+            if self._ahead is not None:
+                self._ahead.close()
         self.save()
         self.model.load_state_dict(self.average.module.state_dict())
 
     def seed_shard(self, shard: int = 0) -> None:
         """Seed the random numbers of a shard of the next step."""
-        self.generator.manual_seed((self.schedule.seed * 1_000_003 + self.step) * 1_009 + shard)
+        self._shard = shard
+        self.generator.manual_seed(self._seed(self.step, shard))
+
+    def _seed(self, step: int, shard: int) -> int:
+        return (self.schedule.seed * 1_000_003 + step) * 1_009 + shard
+
+    def drawn(self, draw: Callable[[torch.Generator], Any]) -> Any:
+        """The samples of the shard that was seeded last, before any other of its random numbers."""
+        if self._ahead is None:
+            return draw(self.generator)
+        step, shard = self.step, self._shard + self.processes.count
+        if shard >= self.schedule.shards:
+            step, shard = step + 1, self.processes.rank
+        return self._ahead.take(draw, self._seed(self.step, self._shard), self._seed(step, shard))
 
     def save(self) -> None:
         """Write the checkpoint into the folder, which exists; the first process does."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
+from dro_grasp.distance_matrix import Segments, segments_of
 from dro_grasp.errors import BundleError
 from dro_grasp.geometry.point_clouds import nearer_half
-from dro_grasp.geometry.se3 import compose, invert, random_rotations, roma, rotate
+from dro_grasp.geometry.se3 import apply, compose, invert, random_rotations, roma, rotate
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
 from dro_grasp.network.presets import NetworkConfig
@@ -29,10 +33,29 @@ class HandSamples:
     obj: Float[Tensor, "b m 3"]  # the object [m], in random order
     normals: Float[Tensor, "b m 3"]
     T_frame_link: Float[Tensor, "b l 4 4"]  # true poses of all links in the grasp
+    segments: Segments  # the hand's links, padded as those of the source's other hands are
     obj_hand: Float[Tensor, "b m 3"]  # the object in the axes of the true hand [m], for the placement prior
     obj_random: Float[Tensor, "b m 3"]  # the same in the axes of a random hand
     position: Float[Tensor, "b 3"]  # true position of the grasp centre in the hand's axes [m]
     proportions: Float[Tensor, " f"]
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """Random numbers of samples, and constants of their hands; those of several hands are joined."""
+
+    T: Float[Tensor, "b 4 4"]  # wrists of stored grasps in their objects' frames
+    index: Int[Tensor, " b"]  # of the objects
+    picks: Int[Tensor, "b m2"]  # points of the object, twice as many as are kept
+    direction: Float[Tensor, "b 3"]  # from which half of the object is seen
+    partial: Float[Tensor, "b 1"]  # uniform: small where half is seen
+    noise: Float[Tensor, "b m 3"]  # normal, as are axis, shift and quaternion
+    axis: Float[Tensor, "b 3"]
+    angle: Float[Tensor, "b 1"]  # uniform: a share of the largest
+    shift: Float[Tensor, "b 3"]  # unused where no placement is known
+    axes: Float[Tensor, "b 3 3"]  # the network's axes in the wrist frame
+    grasp_centre: Float[Tensor, "b 3"]  # in the wrist frame [m]
+    quaternion: Float[Tensor, "b 4"]
 
 
 class SampleSource:
@@ -48,8 +71,9 @@ class SampleSource:
         self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
         self.without = [name for name in bundle.hands if name not in self.names]  # for pretraining
-        self.proportions = {
-            name: proportions(self.hands[name], network.axes(self.hands[name].palm_axes_wrist)) for name in self.names}
+        self.segments = segments_of([self.hands[name] for name in self.names], torch.device(device))
+        self.axes = {name: network.axes(self.hands[name].palm_axes_wrist) for name in self.names}
+        self.proportions = {name: proportions(self.hands[name], self.axes[name]) for name in self.names}
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
         self.centres = self.points.mean(1)
@@ -93,26 +117,57 @@ class SampleSource:
 
     def draw(self, name: str, count: int, generator: torch.Generator) -> HandSamples:
         """Samples of one hand."""
-        hand, (T, q, index) = self.hands[name], self._grasps(name, count, generator)
-        points, normals = self._objects(index, generator)
-        centre = points.mean(1)
-        T_placed = self._placements(hand, T, generator) if self.network.placed else self._centred(hand, T, centre, generator)
-        own = self.network.axes(hand.palm_axes_wrist)
-        world = torch.eye(3, device=T.device).expand(count, 3, 3)
-        axes = T_placed[:, :3, :3] @ own if self.network.placed else world
+        return self.draw_all([name], count, generator)[0]
+
+    def draw_all(self, names: Sequence[str], count: int, generator: torch.Generator) -> list[HandSamples]:
+        """So many samples of each of some hands; what does not depend on the hand is computed for all at once."""
+        drawn = [self._numbers(name, count, generator) for name in names]
+        n = _Numbers(*(torch.cat(values) for values in zip(*(vars(each).values() for each, _, _ in drawn), strict=True)))
+        points, normals = self._objects(n)
+        own, T, centre = n.axes, n.T, points.mean(1)
+        T_placed = self._placed(n) if self.network.placed else self._centred(n, centre)
+        axes = T_placed[:, :3, :3] @ own if self.network.placed else torch.eye(3, device=T.device).expand_as(own)
         T_frame_object = invert(compose(axes, centre))
+        about_centre, rotation = points - centre[:, None], T[:, :3, :3] @ own
+        values = {
+            "obj": about_centre @ axes, "normals": normals @ axes, "obj_hand": about_centre @ rotation,
+            "obj_random": about_centre @ roma.unitquat_to_rotmat(functional.normalize(n.quaternion, dim=-1)),
+            "position": ((apply(T, n.grasp_centre) - centre)[:, None] @ rotation)[:, 0],
+            "open": T_frame_object @ T_placed, "grasp": T_frame_object @ T,
+        }
+        parts = ({key: value[i * count: (i + 1) * count] for key, value in values.items()} for i in range(len(names)))
+        return [self._posed(name, *joints, **part) for name, (_, *joints), part in zip(names, drawn, parts, strict=True)]
+
+    def _numbers(
+        self, name: str, count: int, generator: torch.Generator
+    ) -> tuple[_Numbers, Float[Tensor, "b n_dof"], Float[Tensor, "b n_dof"]]:
+        """Random numbers of a hand's samples, its constants, and the joints of the open hands and of the grasps."""
+        hand, device, m = self.hands[name], generator.device, self.network.n_object
+        T, q, index = self._grasps(name, count, generator)
+
+        def normal(*shape: int) -> Float[Tensor, "..."]:
+            return torch.randn(count, *shape, generator=generator, device=device)
+
+        numbers = _Numbers(
+            T=T, index=index, picks=torch.randint(self.points.shape[1], (count, 2 * m), generator=generator, device=device),
+            direction=normal(3), partial=torch.rand(count, 1, generator=generator, device=device), noise=normal(m, 3),
+            axis=normal(3), angle=torch.rand(count, 1, generator=generator, device=device),
+            shift=normal(3) if self.network.placed else T[:, :3, 3], axes=self.axes[name].expand(count, 3, 3),
+            grasp_centre=hand.grasp_centre_wrist.expand(count, 3), quaternion=T[:, 0])
         opened = hand.random_open_joints(count, generator)
-        T_frame_wrist = T_frame_object @ T
-        about_centre = points - centre[:, None]
+        return dataclasses.replace(numbers, quaternion=normal(4)), opened, q
+
+    def _posed(
+        self, name: str, opened: Float[Tensor, "b n_dof"], q: Float[Tensor, "b n_dof"], **values: Float[Tensor, "b ..."]
+    ) -> HandSamples:
+        """Samples of one hand, whose links are posed in one pass for the open hands and the grasps."""
+        hand, row = self.hands[name], self.names.index(name)
+        wrists = torch.cat([values.pop("open"), values.pop("grasp")])
+        links = wrists[:, None] @ hand.tree.forward(torch.cat([opened, q]))
+        placed, grasp = apply(links[:, hand.link_index], hand.link_points).chunk(2)
         return HandSamples(
-            hand=hand, placed=hand.points(opened, T_frame_object @ T_placed), grasp=hand.points(q, T_frame_wrist),
-            obj=about_centre @ axes, normals=normals @ axes,
-            T_frame_link=T_frame_wrist[:, None] @ hand.tree.forward(q),
-            obj_hand=about_centre @ (T[:, :3, :3] @ own),
-            obj_random=about_centre @ random_rotations(count, generator),
-            position=((hand.grasp_centres(T) - centre)[:, None] @ (T[:, :3, :3] @ own))[:, 0],
-            proportions=self.proportions[name],
-        )
+            hand=hand, placed=placed, grasp=grasp, T_frame_link=links[len(q):], proportions=self.proportions[name],
+            segments=self.segments.rows(slice(row, row + 1)).spread(len(q)), **values)
 
     def draw_motions(
         self, name: str, count: int, generator: torch.Generator
@@ -137,36 +192,40 @@ class SampleSource:
         self, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
     ) -> Float[Tensor, "b 3 3"]:
         """Wrist rotations of open hands near grasps with wrists T of objects about `centre` [m], if no placement is known."""
-        toward = torch.nn.functional.normalize(centre - T[:, :3, 3], dim=-1)
+        toward = functional.normalize(centre - T[:, :3, 3], dim=-1)
         return random_turns(len(T), self.augmentation.tilt, generator, toward) @ T[:, :3, :3]
 
-    def _centred(
-        self, hand: Hand, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
-    ) -> Float[Tensor, "b 4 4"]:
+    def _centred(self, n: _Numbers, centre: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
         """Tilted wrists with the grasp centre in the object's, as at inference: a position that tells nothing of the grasp."""
-        rotation = self.tilted(T, centre, generator)
-        return compose(rotation, centre - rotation @ hand.grasp_centre_wrist)
+        toward = functional.normalize(centre - n.T[:, :3, 3], dim=-1)
+        rotation = turns(n.axis, n.angle * self.augmentation.tilt, toward) @ n.T[:, :3, :3]
+        return compose(rotation, centre - rotate(rotation, n.grasp_centre))
 
-    def _objects(
-        self, index: Int[Tensor, " b"], generator: torch.Generator
-    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 3"]]:
-        m, device = self.network.n_object, generator.device
-        twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
-        direction = torch.randn(len(index), 3, generator=generator, device=device)
-        partial = torch.rand(len(index), 1, generator=generator, device=device) < self.augmentation.partial
-        half = nearer_half(self.points[index[:, None], twice], direction)
-        picks = twice.gather(1, torch.where(partial, half, torch.arange(m, device=device)))
-        points, normals = self.points[index[:, None], picks], self.normals[index[:, None], picks]
-        noise = torch.randn(points.shape, generator=generator, device=device) * self.augmentation.object_noise
-        return points + noise, normals
+    def _objects(self, n: _Numbers) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 3"]]:
+        m, index = self.network.n_object, n.index[:, None]
+        half = nearer_half(self.points[index, n.picks], n.direction)
+        partial = n.partial < self.augmentation.partial
+        picks = n.picks.gather(1, torch.where(partial, half, torch.arange(m, device=half.device)))
+        points, normals = self.points[index, picks], self.normals[index, picks]
+        return points + n.noise * self.augmentation.object_noise, normals
+
+    def _placed(self, n: _Numbers) -> Float[Tensor, "b 4 4"]:
+        turn = turns(n.axis, n.angle * self.augmentation.placement_rotation)
+        return _moved(n.T, n.grasp_centre, turn, n.shift * self.augmentation.placement_shift)
 
     def _placements(self, hand: Hand, T: Float[Tensor, "b 4 4"], generator: torch.Generator) -> Float[Tensor, "b 4 4"]:
         """Wrist poses near the true ones: turned about the grasp centre, and shifted."""
         turn = random_turns(len(T), self.augmentation.placement_rotation, generator)
-        centre = hand.grasp_centre_wrist
         shift = torch.randn(len(T), 3, generator=generator, device=generator.device) * self.augmentation.placement_shift
-        moved = rotate(T[:, :3, :3], centre - rotate(turn, centre)) + shift
-        return compose(T[:, :3, :3] @ turn, T[:, :3, 3] + moved)
+        return _moved(T, hand.grasp_centre_wrist, turn, shift)
+
+
+def _moved(
+    T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "*#b 3"], turn: Float[Tensor, "b 3 3"], shift: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b 4 4"]:
+    """Wrists turned about a point of theirs, and shifted in the world [m]."""
+    moved = rotate(T[:, :3, :3], centre - rotate(turn, centre)) + shift
+    return compose(T[:, :3, :3] @ turn, T[:, :3, 3] + moved)
 
 
 def random_turns(
@@ -174,8 +233,14 @@ def random_turns(
 ) -> Float[Tensor, "count 3 3"]:
     """Rotations about random axes, perpendicular to unit vectors if given, by angles uniform up to the largest [rad]."""
     axis = torch.randn(count, 3, generator=generator, device=generator.device)
+    angle = torch.rand(count, 1, generator=generator, device=generator.device) * largest
+    return turns(axis, angle, across)
+
+
+def turns(
+    axis: Float[Tensor, "b 3"], angle: Float[Tensor, "b 1"], across: Float[Tensor, "b 3"] | None = None
+) -> Float[Tensor, "b 3 3"]:
+    """Rotations by angles [rad] about axes of any length, or about their parts perpendicular to unit vectors."""
     if across is not None:
         axis = axis - (axis * across).sum(-1, keepdim=True) * across
-    axis = torch.nn.functional.normalize(axis, dim=-1)
-    angle = torch.rand(count, 1, generator=generator, device=generator.device) * largest
-    return roma.rotvec_to_rotmat(axis * angle)
+    return roma.rotvec_to_rotmat(functional.normalize(axis, dim=-1) * angle)
