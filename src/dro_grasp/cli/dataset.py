@@ -42,7 +42,7 @@ class Synthesize:
     engine: Literal["local", "ray"] = "local"  # Processes on this machine, or a Ray cluster.
     ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
     """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
-    device: str = "cpu"  # Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
+    device: str = "cpu"  # Device: cpu, cuda or cuda:1. What passes there is judged again by the CPU.
     scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
     seed: int = 0  # The same seed gives the same grasps.
     protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial that grasps must pass.

@@ -100,7 +100,7 @@ class PlacementPrior(nn.Module):
         Returns:
             Rotations, and positions in the hand's axes about the object's centre [m].
         """
-        each = 4.0 * COPIES * len(obj) * self.points[-1].out_features
+        each = 4.0 * COPIES * len(obj) * 2 * self.hand.out_features
         size = at_once(obj.device, ROTATIONS_PER_PART, each)
         parts = side_by_side(lambda some: self(obj @ some, hand.expand(len(some), -1)), rotations.split(size))
         logits, mean, scale, score = (torch.cat(values) for values in zip(*parts, strict=True))

@@ -29,14 +29,14 @@ SETTLED = "settled"
 
 
 def at_rest(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, close_fingers: bool = False
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, close_fingers: bool = False, device: str = "cpu"
 ) -> tuple[GraspBatch, Bool[Tensor, " n"]]:
     """Grasps where closing leaves them, with a pregrasp and a squeeze for the object's weight, and which come to rest.
 
     Energies stay those by which a grasp was once chosen; outcomes are dropped. What does not come to rest stays as it is.
     With `close_fingers`, idle fingers first close onto the object.
     """
-    problem = GraspProblem(hand, obj)
+    problem = GraspProblem(hand, obj, device)
     ready = grasps
     if close_fingers:
         ready = close_idle_fingers(problem.energy(EnergyConfig(hand_points=hand.n_points)), grasps)
@@ -54,7 +54,8 @@ def at_rest(
 
 
 def also_passing(
-    hand: Hand, obj: ObjectModel, passed: GraspBatch, protocols: Sequence[Protocol], workers: int | None = None
+    hand: Hand, obj: ObjectModel, passed: GraspBatch, protocols: Sequence[Protocol], workers: int | None = None,
+    device: str = "cpu",
 ) -> tuple[GraspBatch, Counter[str]]:
     """Of grasps that passed a first protocol, those that pass further ones too, and how many fail each, by reason.
 
@@ -63,7 +64,7 @@ def also_passing(
     """
     failures: Counter[str] = Counter()
     for rules in protocols:
-        trial = simulate(hand, obj, passed, rules, workers=workers)
+        trial = simulate(hand, obj, passed, rules, workers=workers, device=device)
         failures.update(f"{failure.value} under {rules.name}" for failure in trial.failure if failure)
         robustness = torch.where(trial.robustness.isnan(), passed.robustness, trial.robustness)
         labels = tuple(f"{label}, {rules.label}" for label in passed.protocol)

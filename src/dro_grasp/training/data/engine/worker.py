@@ -148,7 +148,7 @@ def valid_grasps(
     grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
     if config.settle and not config.resettle and len(grasps):
-        closed = settle(hand, obj, grasps, config.protocol, workers=1)
+        closed = settle(hand, obj, grasps, config.protocol, workers=1, device=config.synthesis.device)
         shift = hand_shift(hand, grasps, closed)
         made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
         grasps = closed[shift < config.max_shift]
@@ -162,24 +162,24 @@ def _passing(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig
 ) -> tuple[GraspBatch, Counter[str]]:
     """The grasps that pass all protocols with enough contact, and why the others fail."""
-    restless = 0
+    restless, device = 0, config.synthesis.device
     if config.resettle and len(grasps):
-        grasps, stable = at_rest(hand, obj, grasps, config.close_fingers)
+        grasps, stable = at_rest(hand, obj, grasps, config.close_fingers, device)
         restless, grasps = int((~stable).sum()), grasps[stable]
-    trial = simulate(hand, obj, grasps, config.protocol, workers=1)
+    trial = simulate(hand, obj, grasps, config.protocol, workers=1, device=device)
     loose = trial.success & (trial.contacts < config.min_contact_links)
     passed = grasps.with_trial(trial)[trial.success & ~loose]
     if config.close_fingers and not config.resettle and len(passed):
-        passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, workers=1)
+        passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, 1, device)
     failures = Counter(failure.value for failure in trial.failure if failure)
     failures += Counter({LOOSE: int(loose.sum()), RESTLESS: restless})
-    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], workers=1)
+    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], 1, device)
     return passed, failures + later
 
 
 def closed_where_it_holds(
     hand: Hand, obj: ObjectModel, evaluated: GraspBatch, protocol: str | Protocol,
-    min_links: int = EngineConfig.min_contact_links, workers: int | None = None,
+    min_links: int = EngineConfig.min_contact_links, workers: int | None = None, device: str = "cpu",
 ) -> GraspBatch:
     """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
 
@@ -187,12 +187,12 @@ def closed_where_it_holds(
     """
     known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
     relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
-    energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points))
+    energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points), device=device)
     closed = close_idle_fingers(energy, evaluated).replace(energy=evaluated.energy, extra=evaluated.extra)
     rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
     if not len(rows):
         return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
-    trial = simulate(hand, obj, closed[rows], protocol, workers=workers)
+    trial = simulate(hand, obj, closed[rows], protocol, workers=workers, device=device)
     better = trial.success & (trial.contacts >= min_links)
     better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
     order = torch.arange(len(evaluated))
