@@ -69,7 +69,7 @@ class Synthesize:
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
             also=self.also, resettle=self.resettle, close_fingers=not self.keep_idle_fingers,
-            synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle)))
+            synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle))).suited()
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
             config, say_aside)

@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import torch
 
+from dro_grasp.devices import on_accelerator
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.grasps.columns import DEPTH, RELABELLED
@@ -30,6 +31,8 @@ from dro_grasp.training.data.bundle.training_file import split_of
 from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
 
+ON_DEVICE = {"candidates": 2048, "min_candidates": 1024, "max_candidates": 4096, "candidate_budget": 65536}
+"""Sizes of shards whose candidates are made on a device, which takes as long for few (ours)."""
 LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
 
 
@@ -83,6 +86,10 @@ class EngineConfig(Checked):
         super().__post_init__()
         if not 1 <= self.shard[0] <= self.shard[1]:
             raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
+
+    def suited(self) -> EngineConfig:
+        """With shards as large as suits the device."""
+        return dataclasses.replace(self, **ON_DEVICE) if on_accelerator(self.synthesis.device) else self
 
 
 @dataclass(frozen=True)
