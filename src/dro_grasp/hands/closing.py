@@ -257,7 +257,10 @@ class ClosingFinder:
         These are flat hands of which every last joint, but for a thumb's, bends as far back as forth.
         """
         other = self.spreading(found)
-        straight = self.motion.straightest((self.tree.lower + self.tree.upper) / 2, other.bending(found.abduction))
+        bends = other.bending(found.abduction)
+        # No posture of a finger of one joint is straighter than another: its zero is all there is to go by.
+        alone = (self.tree.moves[self.motion.links] & bends)[self.of_one_joint(bends)].any(0)
+        straight = self.motion.straightest(torch.where(alone, self.start, (self.tree.lower + self.tree.upper) / 2), bends)
         last = [int(joints.nonzero()[-1, 0]) for finger in self.fingers
                 if bool((joints := self.tree.moves[finger.tip] & self.movable).any())]
         enough = len(last) - (len(last) >= FEWEST_WITH_THUMB)
@@ -456,8 +459,12 @@ class ClosingFinder:
         shares = torch.linspace(1, 0, PATH).tolist()
         path = torch.stack([self.posture(closing.open_ends, closing.opening_signs, closing.abduction, s) for s in shares])
         axis = Line(_tensor(closing.palm.centre), _tensor(closing.palm.direction))
-        both = torch.tensor([curl.back >= BOTH_WAYS for curl in self.sides[0]])
-        return self.motion.folded(path, self.movable & ~closing.abduction, axis, both)
+        both, bends = torch.tensor([curl.back >= BOTH_WAYS for curl in self.sides[0]]), self.movable & ~closing.abduction
+        return self.motion.folded(path, bends, axis, both & ~self.of_one_joint(bends))
+
+    def of_one_joint(self, bends: JointMask) -> Bool[Tensor, " n_tips"]:
+        """Fingers that one joint bends, all of whose postures are as straight."""
+        return (self.tree.moves[self.motion.links] & bends).sum(1) == 1
 
     @cached_property
     def motion(self) -> FingerMotion:
