@@ -133,7 +133,7 @@ def test_batches_follow_the_device_and_its_memory(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (60 * 2**30, 80 * 2**30))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 5 * 2**30)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 1 * 2**30)
-    assert at_once("cuda", 32, 2**20) == int(0.4 * 64 * 2**10)
+    assert at_once("cuda", 32, 2**20) == int(0.25 * 64 * 2**10)
     assert at_once("cuda", 32, 2**40) == 32
     assert at_once("cuda", 32, 1e6, given=7) == 7
 

@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dro_grasp.devices import require_device
+from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
@@ -31,7 +32,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
-from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import problems_of
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
@@ -39,7 +40,7 @@ from dro_grasp.training.loop import train
 from lab.benchmarks.report import emit
 
 HAND, OBJECT = "allegro", "rubber_duck"
-REPETITIONS = 3
+REPETITIONS = 5
 PREDICTIONS = {"cpu": ((1, 16, 1), (1, 1, 4)), "gpu": ((1, 1024, 1), (64, 16, 1), (1, 1, 4))}
 """Pairs, grasps of each, and candidates of each grasp."""
 STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
@@ -81,31 +82,39 @@ def objects(count: int) -> list[ObjectModel]:
 
 
 def predictions(device: str, repetitions: int) -> list[list[object]]:
-    """Rows of predictions: what, milliseconds of each stage for one candidate, and candidates a second."""
+    """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates a second."""
     hand, rows = load_hand(HAND), []
-    for pairs, num, candidates in PREDICTIONS[kind(device)]:
-        models = objects(pairs)
-        for settled in SETTLED:
-            finish = FinishConfig() if settled else FinishConfig(settle=None)
-            predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
+    for settled in SETTLED:
+        finish = FinishConfig() if settled else FinishConfig(settle=None)
+        predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
+        for pairs, num, candidates in PREDICTIONS[kind(device)]:
+            models, count = objects(pairs), pairs * num * candidates
             request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)
-            count, runs = pairs * num * candidates, []
-            # Closing on the processor takes most of the time, and is timed once.
-            for seed in range(1 + (1 if settled and count > SLOW else repetitions)):
-                begin = time.perf_counter()
-                made = predictor.run_many(
-                    problems_of(hand, models, device, Constraints()), replace(request, seed=seed))
-                stages = {name: sum(one.seconds[name] for one in made if not isinstance(one, Exception)) for name in STAGES}
-                runs.append((time.perf_counter() - begin, stages))
-            whole = statistics.median(seconds for seconds, _ in runs[1:])
-            parts = [statistics.median(stages[name] for _, stages in runs[1:]) for name in STAGES]
+            # Closing in simulation takes most of the time, and is timed once.
+            times = 1 if settled and count > SLOW else repetitions
+            warm = 1 if times == 1 else WARM_RUNS
+            runs = [one_run(predictor, hand, models, replace(request, seed=seed)) for seed in range(warm + times)]
+            kept = runs[warm:]
+            whole = statistics.median(seconds for seconds, _ in kept)
+            parts = [1e3 * statistics.median(stages[name] for _, stages in kept) / count for name in STAGES]
             what = f"{pairs} x {num} x {candidates}, {'settled' if settled else 'scored'}"
-            rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{1e3 * part / count:.3f}" for part in parts),
-                              f"{1e3 * whole / count:.3f}", count / whole]))
+            rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{part:.3f}" for part in parts),
+                              f"{1e3 * whole / count:.3f}", f"{count / whole:.1f}"]))
     return rows
 
 
-SLOW = 100  # Candidates from which on closing on the processor is timed once
+def one_run(
+    predictor: GraspPredictor, hand: Hand, models: list[ObjectModel], request: GraspRequest
+) -> tuple[float, dict[str, float]]:
+    """Seconds of one prediction of all objects, and of its stages."""
+    begin = time.perf_counter()
+    made = predictor.run_many(problems_of(hand, models, predictor.device, Constraints()), request)
+    whole = time.perf_counter() - begin
+    return whole, {name: sum(one.seconds[name] for one in made if isinstance(one, Prediction)) for name in STAGES}
+
+
+SLOW = 100  # Candidates from which on closing in simulation is timed once
+WARM_RUNS = 2  # Predictions that are not counted
 
 
 def descents(device: str, repetitions: int) -> list[list[object]]:
@@ -159,7 +168,7 @@ def main() -> None:
     require_device(options.device)
     repetitions, only = 1 if options.quick else REPETITIONS, options.only.split(",")
     rows: list[list[object]] = []
-    for device in dict.fromkeys(("cpu", options.device)):
+    for device in dict.fromkeys((options.device, "cpu")):
         if "prediction" in only:
             rows += predictions(device, repetitions)
         if "synthesis" in only:

@@ -87,7 +87,7 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
         return list(pool.map(lambda job: work(*job), jobs))
 
 
-MEMORY_SHARE = 0.4
+MEMORY_SHARE = 0.25
 """Share of a device's free memory that one batch may take (ours); the rest is for what is kept, and for errors of estimates."""
 UNKNOWN_MEMORY = 4 * 2**30
 """Free memory of a device that does not tell it [bytes] (ours)."""
