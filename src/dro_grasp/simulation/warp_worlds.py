@@ -22,7 +22,7 @@ from dro_grasp.simulation.worlds import STATE, WARP, ProcessorWorlds
 
 INPUTS = (*STATE, "ctrl", "xfrc_applied", "mocap_pos", "mocap_quat")  # Fields of MjData that steps depend on
 MOST = 4096  # Worlds that step together. Ours: with 16,384, an H100 has no memory for 128 contacts each
-FEWEST = 128  # Worlds of the smallest graph; there is one for each power of two. Ours: fewer are no faster
+FEWEST = 128  # Worlds of the smallest graph; others have powers of two. Ours: fewer are no faster
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
 SPARE = 0.01  # Share of worlds that may have more constraints than fit; they run on the processor (ours)
 LARGEST_ROOM = 1024  # Most contacts, and most constraints, that a world gets memory for (ours)
@@ -85,15 +85,15 @@ class _Graphs:
 
     def __init__(self, scene: TrialScene, device: str, fields: tuple[str, ...]) -> None:
         self._scene, self._device, self._fields = scene, device, fields
-        self._lock = threading.Lock()
+        self._lock, self._number = threading.Lock(), 0
 
     def step(
         self, inputs: dict[str, Float[np.ndarray, "k *_"]], fields: dict[str, Float[np.ndarray, "k *_"]], count: int
     ) -> tuple[dict[str, Float[np.ndarray, "k _"]], Bool[np.ndarray, " k"]]:
         """What becomes of the worlds, and which of them had no room; the room grows where those are many."""
         worlds = len(inputs["qpos"])
-        number = max(FEWEST, 1 << (worlds - 1).bit_length())
         with self._lock:
+            number = self.number(worlds)
             while True:
                 room = _ROOMS.get(hand := self._scene.hand.sha256, Room())
                 graph = _graph(self._scene, self._device, self._fields, number, room)
@@ -101,6 +101,12 @@ class _Graphs:
                 _ROOMS[hand] = _larger(room, overflow[:worlds])
                 if _ROOMS[hand] == room:
                     return {name: values[:worlds] for name, values in after.items()}, overflow[:worlds] != 0
+
+    def number(self, worlds: int) -> int:
+        """Worlds of the graph for so many: the last one, unless it is too small, or four times as large as it must be."""
+        if not self._number / 4 < worlds <= self._number:
+            self._number = max(FEWEST, 1 << (worlds - 1).bit_length())
+        return self._number
 
 
 def _larger(room: Room, overflow: Int[np.ndarray, " k"]) -> Room:
