@@ -45,9 +45,10 @@ def compare(found: Tensor, exact: Tensor, inputs: list[Tensor], doubled: list[Te
         assert float((a - b).detach().abs().max()) <= tolerance * float(b.detach().abs().max())
 
 
+@pytest.mark.parametrize("rounded", [False, True], ids=["exact", "bfloat16"])
 @pytest.mark.parametrize("sizes", [(2, 20, 15, (10, 6)), (1, 9, 35, (70, 40)), (3, 8, 16, (64, 64))], ids=str)
 def test_pairs_equal_the_chunked_form_in_double_precision(
-    kernels: tuple[ModuleType, str], sizes: tuple[int, int, int, tuple[int, int]]
+    kernels: tuple[ModuleType, str], sizes: tuple[int, int, int, tuple[int, int]], rounded: bool
 ) -> None:
     torch.manual_seed(0)
     batch, n, m, hidden = sizes
@@ -57,9 +58,12 @@ def test_pairs_equal_the_chunked_form_in_double_precision(
     twin.load_state_dict(head.state_dict())
     doubled = [t.detach().double().requires_grad_() for t in (hand, obj)]
     exact = naive_distances(twin, *doubled)
-    compare(head(hand, obj), exact, [hand, obj, *head.parameters()], [*doubled, *twin.parameters()], 2e-6)
+    # Rounding moves single units across zero, whose gradient is there or not; the interpreter does not round.
+    tolerance = 0.2 if rounded and kernels[1] == "cuda" else 2e-6
+    found = head(hand, obj, rounded=rounded)
+    compare(found, exact, [hand, obj, *head.parameters()], [*doubled, *twin.parameters()], tolerance)
     with torch.no_grad():
-        assert torch.equal(head(hand, obj), head(hand.detach(), obj.detach()))
+        assert torch.equal(head(hand, obj, rounded=rounded), found)
 
 
 @pytest.mark.parametrize(("n", "k"), [(9, 9), (100, 7)])

@@ -389,9 +389,9 @@ def test_samples_drawn_ahead_in_a_thread_give_the_same_curve(
     schedule: ScheduleConfig, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_stage("train", bundle, tmp_path / "in turn", schedule)
-    drawn, draw = [], SampleSource.draw
+    drawn, draw = [], SampleSource.draw_all
     monkeypatch.setattr(runs, "draws_ahead", lambda _: True)
-    monkeypatch.setattr(SampleSource, "draw", lambda *values: drawn.append(threading.current_thread()) or draw(*values))
+    monkeypatch.setattr(SampleSource, "draw_all", lambda *values: drawn.append(threading.current_thread()) or draw(*values))
     run_stage("train", bundle, tmp_path / "ahead", schedule)
     assert curve(tmp_path / "ahead") == curve(tmp_path / "in turn")
     steps = schedule.steps * schedule.shards
@@ -401,7 +401,7 @@ def test_samples_drawn_ahead_in_a_thread_give_the_same_curve(
 
 def test_a_fault_of_the_thread_that_draws_is_told(bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "draws_ahead", lambda _: True)
-    monkeypatch.setattr(SampleSource, "draw", lambda *_: 1 / 0)
+    monkeypatch.setattr(SampleSource, "draw_all", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run_stage("train", bundle, tmp_path / "run")
 

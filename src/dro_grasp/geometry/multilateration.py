@@ -121,7 +121,7 @@ def _refine_where(
 
 
 def _refine(
-    start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"],
+    start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*#b n m"], anchors: Float[Tensor, "*#b m 3"],
     config: MultilaterationConfig,
 ) -> Float[Tensor, "*b n 3"]:
     """Gauss-Newton steps; autograd sees the last one alone."""
@@ -137,7 +137,7 @@ def _refine(
 
 
 def _step(
-    points: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"],
+    points: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*#b n m"], anchors: Float[Tensor, "*#b m 3"],
     config: MultilaterationConfig,
 ) -> Float[Tensor, "*b n 3"]:
     current = _distances(points, anchors)
@@ -154,7 +154,7 @@ def _step(
 
 
 def _outer_products(
-    points: Float[Tensor, "*b n 3"], weights: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"]
+    points: Float[Tensor, "*b n 3"], weights: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*#b m 3"]
 ) -> Float[Tensor, "*b n 3 3"]:
     """Sum over anchors of weight times (p - a)(p - a)^T, without a tensor of size n x m x 3."""
     squares = (anchors[..., :, None] * anchors[..., None, :]).flatten(-2)
@@ -164,7 +164,7 @@ def _outer_products(
     return own - cross - cross.mT + sums[..., 3:].unflatten(-1, (3, 3))
 
 
-def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
+def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*b n m"]:
     """Distances by one matrix product, for points about the anchors' mean."""
     # Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
     inner = points @ anchors.mT

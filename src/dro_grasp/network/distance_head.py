@@ -9,6 +9,7 @@ Source: paper section III-C and appendix (kernel MLP, matrix block computation);
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -47,8 +48,9 @@ class DistanceHead(nn.Module):
         """
         left, right = self.first.weight.chunk(2, 1)
         both = torch.cat([left, right])
-        hand_sides = _sides(hand @ both.T)
-        object_sides = _sides(obj @ both.T + self.first.bias.repeat(2)).flip(0)
+        with torch.autocast("cuda", torch.bfloat16) if rounded and hand.device.type == "cuda" else nullcontext():
+            first = hand @ both.T, obj @ both.T
+        hand_sides, object_sides = _sides(first[0]), _sides(first[1] + self.first.bias.repeat(2)).flip(0)
         values = hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0]
         fused = fused_kernels(hand_sides)
         pairs: Tensor = fused.PairLayers.apply(*values, rounded) if fused else _PairLayers.apply(*values)  # type: ignore[assignment]
