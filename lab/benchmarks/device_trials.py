@@ -123,7 +123,7 @@ def speed(grasps: GraspBatch, worlds: int, options: argparse.Namespace) -> list[
 
 
 PARTS = (
-    (settling, "settle"), (settling, "pressed"), (settling, "grasp_state"), (settling, "refine"), (settling, "grip"),
+    (settling, "settle"), (settling, "pressed"), (settling, "grasp_state"), (settling, "refine_all"), (settling, "grip_all"),
     (settling, "deepest_penetration"), (grasp_state.Pressed, "payloads"), (grasp_state, "contact_forces"),
     (grasp_state, "squeezes_of"), (grasp_state, "unanswered"), (grasp_state, "pierced"), (trial, "find_contact_links"),
     (Rollout, "_advance"),
