@@ -37,7 +37,7 @@ def test_the_device_is_cuda_where_there_is_one(monkeypatch: pytest.MonkeyPatch, 
         with pytest.raises(OptionError, match=r"device is 'cuda:2'.*finds 2 such"):
             require_device("cuda:2")
     else:
-        with pytest.raises(OptionError, match=r"device is 'cuda:1'.*finds no such.*use --device cpu"):
+        with pytest.raises(OptionError, match=r"device is 'cuda:1'.*finds no such.*use device='cpu'"):
             require_device("cuda:1")
 
 

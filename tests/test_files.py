@@ -184,3 +184,19 @@ def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytes
     file = tmp_path / "assets/hands/ezgripper/ezgripper.urdf"
     file.touch()
     assert (cache_folder(), locate_hand("assets/ezgripper").path) == (tmp_path / "cache", file)
+
+
+@pytest.mark.parametrize("stated", ["", "cache", None])
+def test_an_empty_or_relative_cache_variable_does_not_count(
+    stated: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dro_grasp.objects.cache import cache_folder
+
+    monkeypatch.delenv("DRO_GRASP_CACHE", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    if stated is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", stated)
+    assert cache_folder() == tmp_path / ".cache" / "dro-grasp"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "mine"))
+    assert cache_folder() == tmp_path / "mine" / "dro-grasp"

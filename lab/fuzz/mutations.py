@@ -50,6 +50,10 @@ ELEMENTS = (
     '<keyframe><key name="open" qpos="nan"/></keyframe>', '<compiler angle="degree" meshdir="/"/>', '<mimic joint="a"/>',
     '<mimic joint="b" multiplier="1e30" offset="nan"/>', '<limit lower="-1e6" upper="1e6" effort="1" velocity="1"/>',
     '<mesh filename="left.obj" scale="1e30 1 1"/>', '<xacro:macro xmlns:xacro="http://www.ros.org/wiki/xacro"/>', "<x/>",
+    '<inertial><mass value="-1"/></inertial>', '<inertial pos="0 0 0" mass="1" diaginertia="1 -1 9"/>',
+    '<inertial pos="0 0 0" mass="1" fullinertia="1 1 1 9 9 9"/>', '<connect site1="s" site2="s"/>',
+    '<equality><connect body1="left" body2="right" anchor="0 0 0"/></equality>',
+    '<tendon><spatial name="sp"><site site="s"/><pulley divisor="2"/><site site="s"/></spatial></tendon>',
     '<inertial><mass value="inf"/><inertia ixx="nan" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>',
 )
 """Elements that are put anywhere into a description (ours): what is endless, huge, refers to itself, or is out of place."""

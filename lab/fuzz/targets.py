@@ -17,9 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 import trimesh
+import yaml
 from safetensors.torch import load, save
 
 from dro_grasp.apps.library import store_upload
+from dro_grasp.arm.robot import load_robot
+from dro_grasp.errors import DroGraspError
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion
 from dro_grasp.grasps.batch import GraspBatch
@@ -31,7 +34,8 @@ from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.perception.scan import load_scan
+from dro_grasp.objects.perception.scan import depth_points, load_scan, scanned_object
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.training.data.bundle.training_file import ObjectCloud, load_bundle, write_bundle
 from dro_grasp.training.data.collections.collection import count_collection, read_collection
 from dro_grasp.training.data.collections.importing import read_foreign
@@ -79,8 +83,34 @@ MJCF = """<mujoco model="claw"><compiler angle="degree" autolimits="true"/><opti
 """The same as MJCF, with a tendon, an equality and a keyframe (ours)."""
 SRDF = '<robot><group_state name="open"><joint name="a" value="0.1"/><joint name="b" value="0"/></group_state></robot>'
 """The open posture of the hand (ours)."""
+CONNECTED = """<mujoco model="linked"><compiler angle="radian"/><worldbody><geom type="box" size=".05 .04 .01"/>
+  <body name="left" pos="-.04 0 .01"><joint name="a" axis="0 1 0" range="0 1.4"/><geom type="capsule" size=".006"
+    fromto="0 0 0 0 0 .06"/><site name="eye" pos="0 .01 .03"/></body>
+  <body name="rod" pos="-.06 .01 .01"><joint name="socket" type="ball"/><geom type="capsule" size=".003"
+    fromto="0 0 0 .02 0 .03"/><site name="end" pos=".02 0 .03"/></body>
+  <body name="right" pos=".04 0 .01"><joint name="b" axis="0 -1 0" range="0 1.4"/><geom type="capsule" size=".006"
+    fromto="0 0 0 0 0 .06"/><site name="nail" pos="0 0 .05"/></body></worldbody>
+  <equality><connect site1="eye" site2="end"/></equality>
+  <tendon><spatial name="cord"><site site="eye"/><site site="nail"/></spatial></tendon>
+  <actuator><position joint="b" kp="1"/><position tendon="cord" kp="1"/></actuator></mujoco>"""
+"""Fingers on the world, a rod in a ball joint that closes a loop, and a cord over sites (ours)."""
+ARM = f"""<robot name="arm"><link name="base"/><link name="upper"/><link name="flange"/>
+  <joint name="q1" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>{LIMIT}</joint>
+  <joint name="q2" type="revolute"><parent link="upper"/><child link="flange"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>{LIMIT}
+  </joint></robot>"""
+"""An arm of two joints (ours)."""
+ROBOT: dict[str, Any] = {
+    "name": "r", "arm": "arm.urdf", "hand": "hand.urdf",
+    "mount": {"link": "flange", "position": [0.0, 0.0, 0.02], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    "base": {"position": [0.0, 0.0, 0.1]}, "home": {"q1": 0.5, "q2": 0.5},
+    "limits": {"velocity": 1.0, "acceleration": {"q1": 2.0, "q2": 2.0}, "effort": 30, "position": {"q1": [0.0, 1.0]}},
+    "hand_limits": {"velocity": 2.0, "acceleration": 10.0}, "table": {"height": 0.0, "centre": [0.4, 0.0], "size": [1.0, 1.0]},
+    "camera": {"position": [1.0, 0.0, 0.8], "target": [0.4, 0.0, 0.0], "width": 64, "height": 48, "focal": 60.0}}
+"""A robot with every entry (ours)."""
 MESHES = ("stl", "obj", "ply", "off", "glb", "gltf", "3mf", "dae")
 """Mesh formats (ours: those that the documents name)."""
+CLOUDS = ("cloud.npy", "cloud.ply", "normals.ply", "ascii.pcd", "binary.pcd", "packed.pcd")
+"""Files of clouds."""
 PATHS = (
     "", "a" * 10_000, "/" + "a/" * 3000, "~nobody", "~nobody/x.urdf", "~/x.obj", "\0", "x\0.stl", ".", "..", "/", "/dev/null",
     "/dev/zero", "/dev/full", "/proc/self/mem", "assets/", "assets/../..", "nan", "x.urdf", "x.stl", "x.parquet", "\udcff",
@@ -117,6 +147,8 @@ def make_seeds(folder: Path) -> None:
     head = ("VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 162\nHEIGHT 1\nPOINTS 162\nDATA ")
     (folder / "ascii.pcd").write_text(head + "ascii\n" + "\n".join(" ".join(f"{x:.5f}" for x in p) for p in points.vertices))
     (folder / "binary.pcd").write_bytes(head.encode() + b"binary\n" + points.vertices.astype("<f4").tobytes())
+    _make_clouds(folder, points, head)
+    (folder / "arm.urdf").write_text(ARM)
     (folder / "hand.urdf").write_text(URDF)
     hand, obj = load_hand(folder / "hand.urdf"), load_object(folder / "mesh.stl")
     T = torch.eye(4).repeat(3, 1, 1)
@@ -145,6 +177,24 @@ def make_seeds(folder: Path) -> None:
     with zipfile.ZipFile(folder / "hand.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.write(folder / "hand.urdf", "hand/hand.urdf")
         archive.write(folder / "left.obj", "hand/left.obj")
+
+
+def _make_clouds(folder: Path, points: trimesh.Trimesh, head: str) -> None:
+    """Clouds as PCL packs them and with the normals of a PLY, and a camera's depth image of a ball."""
+    import lzf  # type: ignore  # compiled, without types
+
+    columns = points.vertices.T.astype("<f4").tobytes()
+    packed = lzf.compress(columns, 2 * len(columns)) or columns
+    sizes = len(packed).to_bytes(4, "little") + len(columns).to_bytes(4, "little")
+    (folder / "packed.pcd").write_bytes(head.encode() + b"binary_compressed\n" + sizes + packed)
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    rows = np.concatenate([points.vertices, points.vertex_normals], 1)
+    (folder / "normals.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n" + "\n".join(
+        " ".join(f"{x:.5f}" for x in row) for row in rows))
+    row, column = np.mgrid[:48, :64] - np.array([24, 32])[:, None, None]
+    inside = row**2 + column**2 < 15**2
+    np.savez(folder / "depth.npz", image=np.where(inside, 0.5 - 1e-4 * (15**2 - row**2 - column**2), 0.0),
+             intrinsics=np.array([[200.0, 0, 32], [0, 200, 24], [0, 0, 1]]), mask=inside)
 
 
 def _description(name: str, text: str) -> Callable[[Rng, Path, Path], Path]:
@@ -204,7 +254,33 @@ def _cloud(rng: Rng, seeds: Path, folder: Path) -> Path:
         normals = points * rng.choice((0.0, 1.0, 1e300, float("nan")))
         np.save(path, np.concatenate([points, normals], 1) if rng.random() < 0.5 else points)
         return path
-    return _plain("cloud.npy", "cloud.ply", "ascii.pcd", "binary.pcd", text=kind == 2)(rng, seeds, folder)
+    return _plain(*CLOUDS, text=kind == 2)(rng, seeds, folder)
+
+
+def _depth(rng: Rng, seeds: Path, folder: Path) -> Path:
+    """A depth image, its intrinsics and its mask, of which one or two are of other values, types or shapes."""
+    with np.load(seeds / "depth.npz") as stored:
+        tensors = {name: torch.from_numpy(stored[name]) for name in stored.files}
+    damaged = damage.damage_tensors(rng, tensors)
+    if rng.random() < 0.3:
+        name = rng.choice(list(damaged))
+        damaged[name] = damaged[name] * rng.choice((1e-3, 2, 1e3, 1e4, -1, 1e30))
+    path = folder / "depth.npz"
+    np.savez(path, **{name: tensor.numpy() for name, tensor in damaged.items()})  # type: ignore[arg-type]
+    return path
+
+
+def _robot(rng: Rng, seeds: Path, folder: Path) -> Path:
+    """A damaged robot file, or one whose arm is damaged."""
+    path, kind = folder / "robot.yaml", rng.randrange(6)
+    arm = damage.damage_xml(rng, ARM) if kind == 0 else ARM
+    (folder / "arm.urdf").write_bytes(arm.encode(errors="replace"))
+    for name in ("hand.urdf", "left.obj"):
+        (folder / name).write_bytes((seeds / name).read_bytes())
+    text = yaml.safe_dump(damage.damage_json(rng, ROBOT) if kind > 2 else ROBOT)
+    text = damage.damage_text(rng, text) if kind in (1, 2) else text
+    path.write_bytes(damage.damage_bytes(rng, text.encode()) if kind == 1 else text.encode(errors="replace"))
+    return path
 
 
 def _grasps(rng: Rng, seeds: Path, folder: Path) -> Path:
@@ -312,8 +388,22 @@ def _read_foreign(path: Path) -> None:
 
 
 def _read_cloud(path: Path) -> None:
-    load_object(path)
-    load_scan(path, np.eye(4))
+    """All readers that a cloud has: as an object, of a camera, and as what stands around."""
+    faults = []
+    for read in (load_object, lambda p: load_scan(p, np.eye(4)), load_scene):
+        try:
+            read(path)
+        except DroGraspError as error:
+            faults.append(error)
+    if faults:
+        raise faults[0]
+
+
+def _read_depth(path: Path) -> None:
+    with np.load(path) as stored:
+        given = {name: stored[name] for name in stored.files}
+    points = depth_points(given.get("image"), given.get("intrinsics"), given.get("mask"))  # type: ignore[arg-type]
+    scanned_object("ball", points, np.eye(4))
 
 
 def _read_upload(path: Path) -> None:
@@ -331,8 +421,6 @@ def _read_path(path: Path) -> None:
 
 def attempt(read: Callable[[Any], object], path: Path) -> None:
     """Read; the project's own errors are what is expected."""
-    from dro_grasp.errors import DroGraspError
-
     try:
         read(path)
     except DroGraspError as error:
@@ -342,8 +430,10 @@ def attempt(read: Callable[[Any], object], path: Path) -> None:
 
 TARGETS = {
     "urdf": Target(_description("hand.urdf", URDF), load_hand, 14),
-    "mjcf": Target(_description("hand.xml", MJCF), load_hand, 14), "mesh": Target(_mesh, load_object, 14),
-    "cloud": Target(_cloud, _read_cloud, 8), "grasps": Target(_grasps, _read_grasps, 12),
+    "mjcf": Target(_description("hand.xml", MJCF), load_hand, 10),
+    "linked": Target(_description("hand.xml", CONNECTED), load_hand, 8), "mesh": Target(_mesh, load_object, 14),
+    "cloud": Target(_cloud, _read_cloud, 10), "depth": Target(_depth, _read_depth, 4), "robot": Target(_robot, load_robot, 10),
+    "grasps": Target(_grasps, _read_grasps, 12),
     "weights": Target(_tensors("weights.safetensors", "dro_grasp_weights"), _read_weights, 10),
     "bundle": Target(_tensors("bundle.safetensors", "dro_grasp_bundle"), load_bundle, 8),
     "checkpoint": Target(_plain(CHECKPOINT), _read_run, 4), "log": Target(_plain(LOG, text=True), _read_run, 2),

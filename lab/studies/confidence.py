@@ -56,7 +56,7 @@ def returned(
         made = predictor.run(GraspProblem(hand, partial_view(obj, view, seed)), GraspRequest(num, seed, least_confidence=0.0))
     except NoGraspError:
         return torch.zeros(0), torch.zeros(0, dtype=torch.bool)
-    return made.grasps.confidence, simulate(hand, obj, made.grasps, protocol).success
+    return made.grasps.confidence, simulate(hand, obj, made.grasps, protocol, another=True).success
 
 
 def main() -> None:

@@ -57,7 +57,7 @@ def scored(predictor: GraspPredictor, hand_name: str, object_name: str, view: Vi
     lacking = missing_clearance(problem.energy(EnergyConfig()), grasps, problem.obj.seen)
     config = SettleConfig()
     whole = (grasps.score - config.guess_offset + config.clearance_worth * lacking) / config.guess_worth
-    return torch.stack([whole, lacking, simulate(hand, obj, grasps).success.float()], 1)
+    return torch.stack([whole, lacking, simulate(hand, obj, grasps, another=True).success.float()], 1)
 
 
 def fit(features: Float[Tensor, "n 2"], held: Bool[Tensor, " n"]) -> Float[Tensor, "3"]:

@@ -35,7 +35,7 @@ def require_device(name: str) -> None:
         raise OptionError(f"device is '{name}'; give cpu, cuda, cuda:1 or mps") from None
     count = {"cuda": torch.cuda.device_count, "mps": torch.mps.device_count}.get(device.type)
     if count is not None and count() <= (device.index or 0):
-        raise OptionError(f"device is '{name}', but torch {torch.__version__} finds {count() or 'no'} such; use --device cpu, "
+        raise OptionError(f"device is '{name}', but torch {torch.__version__} finds {count() or 'no'} such; use device='cpu', "
                           f"which always works, or install a build of torch with {device.type.upper()}")
 
 

@@ -55,5 +55,14 @@ class TrainingError(DroGraspError):
     """Training cannot continue, for example after a non-finite loss."""
 
 
+class ClusterError(DroGraspError):
+    """A cluster of machines on which work is done is gone."""
+
+
 class ServerError(DroGraspError):
     """A grasp server refuses a request, fails, or is not there."""
+
+    def __init__(self, message: str, retry_after: float | None = None) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
+        """When it is worth while to ask again [s]; None where that is not known."""

@@ -18,6 +18,7 @@ import yaml
 from scipy.spatial.distance import pdist
 
 import dro_grasp as dro
+import dro_grasp.arm.robot as dro_robot
 from dro_grasp.arm.motion import STAGES, MotionPlan
 from dro_grasp.arm.planner import PlanConfig, Task, plan
 from dro_grasp.arm.robot import BUILTIN_ROBOTS
@@ -269,3 +270,112 @@ def test_a_robot_file_without_a_table_has_the_ground_for_one(
     assert made.notes.table == 0.0
     wrist = torch.from_numpy(robot.T_world_wrist(made.arm.position)).float()
     assert float(robot.hand.points(torch.from_numpy(made.hand.position).float(), wrist)[..., 2].min()) > 0
+
+
+@pytest.fixture(scope="module")
+def grasped(robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]) -> dro.GraspBatch:
+    """Grasps of the standing can in the world, which cost no time."""
+    obj, T = standing
+    made = dro.GraspPredictor().predict(robot.hand, obj, 8, seed=0, source="optimiser", candidates=1, table=float(-T[2, 3]))
+    return made.replace(T_object_wrist=torch.from_numpy(T).float() @ made.T_object_wrist, extra={})
+
+
+def test_a_plan_begins_where_the_arm_is(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], grasped: dro.GraspBatch
+) -> None:
+    config = PlanConfig(rehearsals=0)
+    starts = [robot.home, robot.home + 0.3 * np.sign(robot.home.mean() - robot.home), [*robot.home[:-1], robot.home[-1] + 1.0]]
+    for start in starts:
+        made = plan(robot, *standing, config=config, grasps=grasped, start=start)
+        np.testing.assert_allclose(made.arm.position[0], start, atol=1e-9)
+        assert made.arm.velocity[0] == pytest.approx(0.0)
+    np.testing.assert_array_equal(plan(robot, *standing, config=config, grasps=grasped).arm.position[0], robot.home)
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda q, robot: q[:-1], r"start has \d values; robot '.*' has \d arm joints: "),
+    (lambda q, robot: [*q, 0.0], r"start has \d values"),
+    (lambda q, robot: np.array([*q[:-1], robot.upper[-1] + 0.01]), r"start puts joint '.*' at .*, outside its limits .* to"),
+    (lambda q, robot: np.array([np.nan, *q[1:]]), r"start puts joint '.*' at nan, outside its limits"),
+    (lambda q, robot: np.rad2deg(q) + 100, r"outside its limits .* give radians"),
+])
+def test_a_start_that_the_arm_cannot_have_is_refused(
+    change: Any, told: str, robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], grasped: dro.GraspBatch
+) -> None:
+    with pytest.raises(OptionError, match=told):
+        plan(robot, *standing, grasps=grasped, start=change(robot.home, robot))
+
+
+def test_a_start_in_the_table_is_refused(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], grasped: dro.GraspBatch
+) -> None:
+    """The lowest of many configurations, by kinematics alone."""
+    lower, upper = robot.working_range
+    draws = np.random.default_rng(0).uniform(lower, upper, (4000, len(lower)))
+    lowest = draws[robot.T_world_wrist(draws)[:, 2, 3].argmin()]
+    assert robot.T_world_wrist(lowest)[2, 3] < -0.1
+    with pytest.raises(RobotError, match=r"collides at the start: .*begin elsewhere \(start="):
+        plan(robot, *standing, grasps=grasped, start=lowest)
+
+
+def lowest_above(robot: dro.Robot, made: MotionPlan, centre: np.ndarray, half: float) -> float:
+    """Lowest corner of any shape of hand or moving arm over a square in the world, during the whole motion [m].
+
+    Shapes as they are drawn, placed by MuJoCo, which knows nothing of the planner's scene.
+    """
+    scene = robot_spec(robot, PROTOCOLS["dro"], None)
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    (fingers, moving), tree = joint_addresses(model, robot.hand), robot.hand.tree
+    _, _, arm, hand = finer(made)
+    full = hand @ tree.coupling.double().numpy().T + tree.offset.double().numpy()
+    lowest = np.inf
+    shapes = [(f"arm/{robot.arm.tree.link_names[s.link]}", s.vertices) for s in robot.arm.geometry if s.link > 0]
+    assert robot.hand.description is not None
+    shapes += [(f"hand/{robot.hand.tree.link_names[s.link]}", s.vertices) for s in robot.hand.description.geometry]
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    shapes = [(name, vertices) for name, vertices in shapes if name in bodies]
+    assert any(name.startswith("hand/") for name, _ in shapes)
+    for q, joints in zip(arm[::5], full[::5, moving], strict=True):
+        data.qpos[arm_addresses(model, robot)], data.qpos[fingers] = q, joints
+        mujoco.mj_kinematics(model, data)
+        for name, vertices in shapes:
+            body = data.body(name)
+            points = vertices @ body.xmat.reshape(3, 3).T + body.xpos
+            inside = (np.abs(points[:, :2] - centre) < half).all(1)
+            lowest = min(lowest, float(points[inside, 2].min(initial=np.inf)))
+    return lowest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("named", ["xarm7_leaphand", "ur5e_allegro", "small"])
+@pytest.mark.parametrize(("name", "turn", "height"), [("can", 0.0, 0.0), ("can", np.pi / 2, 0.0), ("can", 0.0, 0.12)])
+@pytest.mark.parametrize("stated", [True, False], ids=["table", "no table"])
+def test_no_plan_passes_what_the_object_stands_on(
+    named: str, name: str, turn: float, height: float, stated: bool, small_robot: str
+) -> None:
+    """Several arms and hands, poses and heights, with and without a table in the robot file."""
+    robot, obj, T = dro.load_robot(small_robot if named == "small" else named), dro.load_object(name), np.eye(4)
+    T[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    T[:3, 3] = 0.5, 0.1, height - float((obj.cloud @ T[2, :3]).min())
+    table = dro_robot.Table(height, (0.55, 0.1), (0.6, 0.6)) if stated else None
+    robot = replace(robot, table=table, camera=None)
+    made = plan(robot, obj, T, config=PlanConfig(num=8, rehearsals=0), seed=1)
+    assert made.notes.table == pytest.approx(height, abs=1e-4)
+    assert lowest_above(robot, made, np.array([0.5, 0.1]), 0.2) > height - 1e-3
+
+
+def test_grasps_below_the_foot_of_an_object_are_refused_without_a_table_as_with_one(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    obj, T = standing
+    made = dro.GraspPredictor().predict(robot.hand, obj, 24, seed=0, source="optimiser", candidates=1, direction=(1, 0, 0),
+                                        max_tilt=0.8, least_confidence=0.0)
+    placed = made.replace(T_object_wrist=torch.from_numpy(T).float() @ made.T_object_wrist, extra={})
+    lowest = robot.hand.points(placed.joints, placed.T_object_wrist)[..., 2].amin(1)
+    low = placed[lowest < -0.015]
+    assert len(low) >= 3
+    assert robot.table is not None
+    for table in (None, robot.table):
+        with pytest.raises(PlanError, match="and none is left for 'can'"):
+            plan(replace(robot, table=table), obj, T, grasps=low, config=PlanConfig(rehearsals=0))

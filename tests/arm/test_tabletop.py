@@ -73,7 +73,7 @@ def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
     again = str(tmp_path / "004" / ".." / "003" / "textured.obj")
     (done,) = run_tabletop(TabletopRun(small_robot, (box, again), attempts=1, config=QUICK), output, make=ended)
     assert (done.object, done.object_file) == ("textured", box)
-    with pytest.raises(OptionError, match=rf"'{other}' is not the object 'textured' .* made with '{box}'.*--output"):
+    with pytest.raises(OptionError, match=rf"'{other}' is not the object 'textured' .* made with '{box}'.*output="):
         run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
     whole, half = dro.load_object(box), trimesh.creation.box((0.025, 0.05, 0.08))
     halves = tuple((np.add(half.vertices, [x, 0, 0]), half.faces) for x in (-0.0125, 0.0125))

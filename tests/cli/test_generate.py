@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 from collections import Counter
 from pathlib import Path
@@ -11,10 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
+from dro_grasp.cli import output
 from dro_grasp.cli.main import main
 from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands import library
+from dro_grasp.objects import catalogue
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import feasible
@@ -40,6 +46,23 @@ def test_saving_the_successful_without_a_trial_is_refused(weights: str, tmp_path
         assert main([*common, *more]) == 2
         assert "name a --protocol" in capsys.readouterr().err
     assert not (tmp_path / "a.parquet").exists()
+
+
+def test_a_terminal_shows_at_once_what_is_done(weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before a library, the hand or the object is loaded, and through all of it."""
+    monkeypatch.setattr(output, "stderr", Console(file=(shown := io.StringIO()), force_terminal=True, width=120))
+    seen: dict[str, str] = {}
+    hand = loaded_hand("gripper3")
+    monkeypatch.setattr(library, "load_hand", lambda name: seen.setdefault("hand", shown.getvalue()) and hand)
+    monkeypatch.setattr(catalogue, "load_object", lambda name, **more: seen.setdefault("object", shown.getvalue()) and refuse())
+    assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights]) == 2
+    assert "loading libraries, hand and weights" in seen["hand"]
+    assert "reading sphere" in seen["object"]
+    assert "reading" not in seen["hand"]
+
+
+def refuse() -> None:
+    raise ObjectError("enough")
 
 
 def test_outputs_are_checked_before_the_work(capsys) -> None:

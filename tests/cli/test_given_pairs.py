@@ -108,7 +108,7 @@ def test_an_object_that_is_given_stands_for_one_alone(
     first, second = names
     both.replace(object=(first, second, second)).save("both.parquet")
     assert main([command[0], "both.parquet", "--object", "sphere", *command[1:]]) == 2
-    assert "both.parquet holds grasps of 2 objects; --object fits a file with one" in capsys.readouterr().err
+    assert "both.parquet holds grasps of 2 objects; another object fits a file with one" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["both.parquet"]
 
 

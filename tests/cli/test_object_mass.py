@@ -80,7 +80,7 @@ def test_grasps_of_several_masses_need_one_to_be_stated(
     for other, named in ((0.4, "0.4 kg and 0.7 kg"), (None, "0.7 kg and none")):
         GraspBatch.concatenate([made_for(0.7), made_for(other), made_for(0.2, "can")]).save(path)
         assert main(["evaluate", str(path)]) == 2
-        assert f"the grasps of 'cube' were made for several masses, {named}; state one with --mass" in capsys.readouterr().err
+        assert f"the grasps of 'cube' were made for several masses, {named}; state one (--mass)" in capsys.readouterr().err
     assert not tried
     assert main(["evaluate", str(path), "--mass", "0.5", "--json"]) == 0
     assert tried == pytest.approx([0.5, 0.5])

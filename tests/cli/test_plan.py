@@ -41,8 +41,11 @@ def planned(asked: dict[str, Any], small_robot: str, monkeypatch: pytest.MonkeyP
     scene = PlanScene(np.zeros((1, 3)), np.zeros((0, 3)), wrist, np.zeros((1, 1)), np.zeros(1), (CHOSEN,))
     made = dro.MotionPlan(NOTES, scene, np.array([0, 0, 1, 2, 3, 4]), still, still)
 
-    def plan(robot: Any, obj: Any, T: Any, obstacles: Any, predictor: Any, config: Any, seed: int) -> dro.MotionPlan:
-        asked.update(robot=robot, obj=obj, T=T, obstacles=obstacles, predictor=predictor, config=config, seed=seed)
+    def plan(
+        robot: Any, obj: Any, T: Any, obstacles: Any, predictor: Any, config: Any, seed: int, start: Any
+    ) -> dro.MotionPlan:
+        asked.update(
+            robot=robot, obj=obj, T=T, obstacles=obstacles, predictor=predictor, config=config, seed=seed, start=start)
         return made
 
     return lambda *options: parse(["plan", "--robot", small_robot, "--object", "can", *options]).run(plan)
@@ -56,13 +59,14 @@ def test_every_option_reaches_the_planner_and_every_file_is_written(
     numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", weights,
                "--least-confidence", "0.35"]
     files = ["--output", "plan.npz", "--trajectory", "plan.yaml", "--csv", "plan.csv"]
-    where = ["--at", "0.5", "0.1", "--obstacles", "cube"]
+    where = ["--at", "0.5", "0.1", "--obstacles", "cube", "--start", "0.1", "-0.2", "3"]
     assert planned(*where, *palm, *places, *numbers, *files, "--json") == 0
     hold, spare = ((0.5, 0.1, 0.2, 0.03),), ((0, 0, 1, 0.1), (0, 0, 2, 0.2))
     constraints = dro.Constraints((0, 0, -1), None, 0.6, None, hold, spare, 0.012)
     assert asked["config"] == dro.PlanConfig(
         9, 2, constraints=constraints, rehearsals=4, planner_seconds=2.5, least_confidence=0.35)
     assert (asked["seed"], asked["predictor"].weights_name) == (7, dro.load_weights(weights).name)
+    assert asked["start"] == (0.1, -0.2, 3.0)
     assert (asked["obj"].name, [o.name for o in asked["obstacles"]]) == ("can", ["cube"])
     stands = np.asarray(asked["obj"].vertices) @ asked["T"][:3, :3].T + asked["T"][:3, 3]
     assert stands[:, 2].min() == pytest.approx(asked["robot"].table.height, abs=1e-3)
@@ -89,6 +93,7 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
     assert "motion of 5.0 s" in said
     assert said.endswith("csv: plan.csv\n")
     assert asked["config"] == dro.PlanConfig()
+    assert asked["start"] is None
 
 
 def test_efforts_that_are_unknown_are_told(planned: Planned, capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +112,7 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
 
 @pytest.mark.parametrize(("options", "said"), [
     (["--seed", "-1"], "seed is -1; give an integer from 0"),
-    (["--max-tilt", "0.5"], "give both, for example --direction 0 0 -1"),
+    (["--max-tilt", "0.5"], "give both, for example direction=(0, 0, -1)"),
     (["--output", "nowhere/plan.npz"], "create it first"),
     (["--at", "nan", "0.1"], "--at is nan 0.1; give x and y in metres"),
     (["--at", "0.5", "inf"], "--at is 0.5 inf; give x and y in metres"),

@@ -62,6 +62,16 @@ def test_no_object_is_a_table(name: str) -> None:
         assert table_plane(half) is None
 
 
+def test_what_a_camera_scatters_hides_no_table_and_many_things_on_it_do_not() -> None:
+    rng = np.random.default_rng(0)
+    points, _ = on_table("soap", 0.6)
+    below = np.column_stack([rng.uniform(-0.3, 0.3, (60, 2)), points[:, 2].min() - rng.uniform(0.02, 0.1, 60)])
+    beside = np.column_stack([rng.uniform(-0.3, 0.3, (40, 2)), points[:, 2].min() + rng.uniform(0.02, 0.3, 40)])
+    assert table_plane(np.concatenate([points, below, beside])) is not None
+    things = [points[:-3000] + np.array([x, y, 0]) for x in (-0.22, 0.22) for y in (-0.22, 0.22)]  # their hull is the table's
+    assert table_plane(np.concatenate([*things, points[-3000:]])) is not None
+
+
 def test_too_little_is_no_table() -> None:
     assert table_plane(np.zeros((100, 3))) is None
     assert table_plane(np.zeros((3, 3))) is None

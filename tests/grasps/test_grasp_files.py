@@ -13,6 +13,8 @@ from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.files import check_output
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import UNKNOWN_PROTOCOL
+from dro_grasp.simulation.protocols import PROTOCOLS, Perturbations, Protocol, changed
 from tests.helpers.toy_batches import BALL, CUBE, HAND, evaluated, make
 
 
@@ -174,3 +176,28 @@ def test_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
         make(3).save(path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["g.parquet"]
+
+
+@pytest.mark.parametrize("label", [
+    "<img src=x onerror=alert(1)>", "carry/1</b>", "carry\nstrict", "a b", "x" * 5000 + " ", "carry/",
+    "carry/1,strict/1", "+/1"])
+def test_a_protocol_that_no_trial_could_have_is_refused_when_read_and_when_written(tmp_path, label):
+    path = tmp_path / "g.parquet"
+    evaluated(3).save(path)
+    table = pq.read_table(path)
+    column = table.column_names.index("protocol")
+    pq.write_table(table.set_column(column, "protocol", pa.array(["strict/1", label, None])), path)
+    own = evaluated(1).replace(protocol=(label,))
+    for refused in (lambda: GraspBatch.load(path), lambda: own.save(tmp_path / "h.parquet")):
+        with pytest.raises(GraspFileError, match=r"is unknown; trials state a name and a version, such as carry/1") as told:
+            refused()
+        assert len(str(told.value)) < 600
+    assert not (tmp_path / "h.parquet").exists()
+
+
+def test_protocols_as_trials_state_them_are_read(tmp_path):
+    own = Protocol("my-own.v2", max_displacement=0.02, mass=1e-5, perturbations=Perturbations(trials=4, friction=(0.5, 1.0)))
+    robust, light = PROTOCOLS["robust"], changed("carry", friction=0.3, mass_factor=2.0)
+    labels = [own.label, robust.label, light.label, f"{light.label}, {robust.label}", UNKNOWN_PROTOCOL, "strict"]
+    evaluated(len(labels)).replace(protocol=tuple(labels)).save(tmp_path / "g.parquet")
+    assert list(GraspBatch.load(tmp_path / "g.parquet").protocol) == labels

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import dro_grasp as dro
+from dro_grasp.hands import closing
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.opening import BEHIND, FingerMotion
@@ -147,3 +148,13 @@ def test_a_hand_limited_to_its_use_is_the_hand_but_for_its_limits(folder: Path) 
     assert torch.equal(used.tree.upper, hand.upper)
     plain = original(folder, "gripper3")[1]
     assert plain.limited_to_use() is plain
+
+
+def test_a_finger_as_thick_as_a_barrel_costs_no_more_than_a_finger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Places between palm and fingers are looked for on a grid, which grew with the cube of the hand.
+    looked: list[int] = []
+    query = closing.KDTree.query
+    monkeypatch.setattr(closing.KDTree, "query", lambda tree, x, *a: looked.append(len(x)) or query(tree, x, *a))
+    links = link("left") + link("right", '<sphere radius="0.4"/>')
+    dro.load_hand(written(tmp_path, claw(links=links), "barrel.urdf"))
+    assert max(looked) <= closing.GRID_CELLS

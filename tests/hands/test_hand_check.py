@@ -40,6 +40,15 @@ def notes(folder: Path, text: str) -> dict[str, str]:
     return {note.subject: note.text for note in check_hand(written(folder, text)).notes}
 
 
+def test_findings_of_the_same_words_are_one_line_for_people_and_one_each_for_programs(tmp_path: Path) -> None:
+    drawn = claw(links=link("left", kinds=("visual",)) + link("right", kinds=("visual",)) + link("third")
+                 + joint("c", "palm", "third", "0 0.03 0.01", "1 0 0"))
+    report = check_hand(written(tmp_path, drawn))
+    told = [line for line in report.lines() if "cannot touch anything" in line]
+    assert told == ["warning: left, right: has a visual but no collision shape; it cannot touch anything"]
+    assert [n["subject"] for n in report.to_dict()["notes"] if "cannot touch" in n["text"]] == ["left", "right"]
+
+
 def test_check_names_free_coupled_and_unlimited_joints(tmp_path: Path) -> None:
     tip = link("tip")
     joints = (joint("a", "palm", "left", "-0.035 0 0.01", kind="continuous", more="")

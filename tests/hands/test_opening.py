@@ -155,7 +155,7 @@ def test_an_srdf_beside_the_urdf_may_state_the_open_posture(tmp_path: Path) -> N
     path = written(tmp_path, folding_claw(math.pi), "hand.urdf")
     plain = dro.load_hand(path)
     joints = '<joint name="a" value="-1.0"/><joint name="of_the_arm" value="3"/>'
-    written(tmp_path, SRDF.format(name="closed", joints=joints), "hand.srdf")
+    written(tmp_path, SRDF.format(name="rest", joints=joints), "hand.srdf")
     assert dro.load_hand(path).sha256 == plain.sha256, "another state says nothing"
     written(tmp_path, SRDF.format(name="open", joints=joints), "hand.srdf")
     hand = dro.load_hand(path)

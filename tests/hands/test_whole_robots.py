@@ -176,3 +176,21 @@ def test_grasps_record_the_part_that_they_were_made_for(tmp_path: Path) -> None:
     for recorded in (with_sources(grasps, given, "sphere", 1.0), with_own_files(grasps, hand, obj)):
         found = hand_of(GraspBatch.load(BytesIO(recorded.to_bytes())), None)
         assert (found.name, found.sha256) == (hand.name, hand.sha256)
+
+
+PLATE = '<link name="plate"><visual><geometry><box size="0.05 0.05 0.01"/></geometry></visual></link>'
+FLAT = claw(PLATE + '<link name="mount"/><joint name="flange" type="fixed"><parent link="mount"/><child link="palm"/></joint>'
+            '<joint name="skin" type="fixed"><parent link="palm"/><child link="plate"/></joint>')
+FLAT_MJCF = ("<mujoco><worldbody><body name='mount'><geom size='.02'/><body name='palm'><geom type='box' size='.04 .04 .01'/>"
+             "<body name='left' pos='-.03 0 0'><joint name='a' axis='0 1 0' range='0 80'/><geom size='.01'/></body>"
+             "<body name='plate'><geom type='box' size='.02 .02 .01'/><site/></body></body></body></worldbody></mujoco>")
+
+
+@pytest.mark.parametrize(("text", "name"), [(FLAT, "hand.urdf"), (FLAT_MJCF, "hand.xml")])
+def test_a_link_beside_the_fingers_is_refused_and_the_one_that_carries_them_named(tmp_path: Path, text: str, name: str) -> None:
+    path = written(tmp_path, text, name)
+    with pytest.raises(HandError, match=rf"link 'plate' moves; the fingers hang on 'palm', which carries it: give {name}#palm"):
+        load_hand(f"{path}#plate")
+    with pytest.raises(HandError, match="nothing that hangs on link 'left' moves, so no hand begins there"):
+        load_hand(f"{path}#left")
+    assert load_hand(f"{path}#palm").tree.link_names[0] == "palm"

@@ -13,6 +13,7 @@ class Answer(NamedTuple):
 
     status: int
     text: str
+    headers: dict[str, str]
 
     def json(self) -> Any:
         return json.loads(self.text)
@@ -54,7 +55,7 @@ class Caller:
 
         await self.app(scope, receive, send)
         text = b"".join(message.get("body", b"") for message in said).decode()
-        return Answer(said[0]["status"], text)
+        return Answer(said[0]["status"], text, {name.decode(): value.decode() for name, value in said[0]["headers"]})
 
 
 async def live(app: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -32,15 +33,19 @@ class QuickAnswerer:
         return ["can"]
 
     def answer(self, call: Any, progress: Callable[[int, int], None]) -> Any:
-        """`echo`, `die`, `sleep` until it is cancelled, or `hang` whatever is said."""
+        """`echo`, `die`, be `killed`, `nap` for half a second, `sleep` until it is cancelled, or `hang` whatever is said."""
         if call.hand == "die":
             os._exit(7)
+        if call.hand == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
         if call.hand == "wrong":
             raise OptionError("num is 0")
         if call.hand == "faulty":
             raise ZeroDivisionError
         if call.hand == "hang":
             time.sleep(60)
+        if call.hand == "nap":
+            time.sleep(0.5)
         while call.hand == "sleep":
             progress(0, 1)
             time.sleep(0.01)

@@ -109,7 +109,7 @@ def test_vectors_of_any_kind_become_plain_numbers() -> None:
 @pytest.mark.parametrize("direction", [
     (0, -1), (0, 0, -1, 0), (), 3.0, "up", "001", ("0", "0", "1"), (0, 0, "x"), np.eye(3), torch.eye(3)])
 def test_a_direction_that_is_no_vector_is_refused(direction: object) -> None:
-    with pytest.raises(OptionError, match=r"direction is .*; give three numbers, .*--direction 0 0 -1"):
+    with pytest.raises(OptionError, match=r"direction is .*; give three numbers, .*direction=\(0, 0, -1\)"):
         given(direction=direction)
 
 

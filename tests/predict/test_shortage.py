@@ -119,7 +119,7 @@ def test_what_is_too_wide_from_one_direction_alone_is_told_so(jaws: Hand, tmp_pa
         (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), None))
     assert len(above) == 1
     assert "Seen from this direction" in above[0].fact
-    assert "another direction (--direction)" in above[0].remedy
+    assert "another direction (direction=...)" in above[0].remedy
     assert side == free == []
 
 
@@ -130,7 +130,7 @@ def test_words_count_what_became_of_candidates(jaws: Hand, tmp_path: Path) -> No
     assert "only 3 of 20 candidates" in words
     assert "8 hold with a probability below 10 % (fingers 5 push it away as they close, 2 give way under its weight)" in words
     assert "Try another seed" in words
-    assert "--least-confidence 0" in words
+    assert "least_confidence=0" in words
     plain = Tally(3, 20, {}, {}, 0.1).in_words(problem, 4, alone=True)
     assert "probability" not in plain
     assert "--least-confidence" not in plain

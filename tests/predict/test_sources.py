@@ -125,7 +125,8 @@ def test_a_class_of_yours_stands_in_the_table(mine: Path, capsys: pytest.Capture
 
 @pytest.mark.parametrize(("name", "told"), [
     ("sorcery", "there is no source 'sorcery'; choose auto, network"), ("no_such_module:Mine", "cannot be imported"),
-    ("somebodys_module:Yours", "cannot be imported"), ("somebodys_module:Mute", "has no predict"), ("mean-grasp", "--bundle"),
+    ("somebodys_module:Yours", "cannot be imported"), ("somebodys_module:Mute", "has no predict"),
+    ("mean-grasp", "bundle=PATH"),
     ("somebodys_module:Needy", "cannot be made without arguments .*'temperature'.*give a class or function that takes none"),
     ("somebodys_module:NUMBER", "cannot be made without arguments .*not callable"),
     ("network", r"GraspPredictor\(\).source\('network'\) makes it"),

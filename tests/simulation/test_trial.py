@@ -15,6 +15,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation import rollout as rollouts
 from dro_grasp.simulation.grasp_state import grasp_state
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure
@@ -322,3 +324,18 @@ def test_synthesized_grasps_of_the_paper_hands_hold(name: str, assets_folder: Pa
     T = grasps.T_object_wrist.clone()
     T[:, :3, 3] += 0.3 * T[:, :3, 3] / T[:, :3, 3].norm(dim=-1, keepdim=True)
     assert not simulate(hand, can, grasps.replace(T_object_wrist=T), "dro").success.any()
+
+
+def test_another_object_than_theirs_is_refused_unless_it_is_meant(hand: Hand, obj: ObjectModel) -> None:
+    other = replace(obj, name="other", sha256="0" * 64)
+    grasps = GraspBatch.create(hand, other, torch.eye(4)[None], hand.canonical_joints()[None])
+    for rules in ("dro", "strict"):
+        with pytest.raises(ObjectError, match=rf"are for object 'other', and '{obj.name}' is another one.*another=True"):
+            simulate(hand, obj, grasps, rules)
+        with pytest.raises(ObjectError, match="another one"):
+            evaluate(GraspProblem(hand, obj), grasps, rules)
+    assert len(simulate(hand, obj, grasps, "dro", another=True).success) == 1
+    renamed, changed = replace(obj, name="renamed"), replace(obj, sha256="1" * 64)
+    for same in (renamed, changed):
+        own = GraspBatch.create(hand, same, torch.eye(4)[None], hand.canonical_joints()[None])
+        assert len(simulate(hand, obj, own, "dro").success) == 1

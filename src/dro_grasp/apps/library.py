@@ -84,6 +84,8 @@ class Library:
         return self._of_name("scene", name, load_scene)
 
     def _of_name(self, kind: Kind, name: str, load: Callable[[Any], Any]) -> Any:
+        if name not in self.names(kind):  # a name from elsewhere could be the path of any file
+            raise OptionError(f"no {kind} is called '{name}' here; pick one of the list")
         source = self.own[kind].get(name, name)
         if isinstance(source, str | Path):
             return self.loaded(kind, name, lambda: load(source))

@@ -20,7 +20,7 @@ from torch import Tensor
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
 from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.trajectory import find_path, timed_stages
 from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
 from dro_grasp.devices import Stopwatch, side_by_side
@@ -43,6 +43,9 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
 
 Directions = Literal["paper", "all"]  # Palm directions that are asked for
+ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
+BASE_ROOM = 0.15  # Distance of its edge from the middle of the arm's base, where that is possible [m] (ours)
+SURROUNDS = 0.1  # Least distance of its edge from what stands on it [m] (ours)
 PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 
@@ -63,7 +66,7 @@ class PlanConfig(Checked):
     rounds: int = 3
     """Largest number of times that the planner is asked, each time with the next `top` grasps."""
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated, on the object as it is known; 0 for none. It needs a table."""
+    """Grasps of each batch whose lift is simulated, on the object as it is known; 0 for none."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
     """How the rehearsals of one grasp deviate from what is known."""
     trusted_share: float = 0.5
@@ -111,11 +114,12 @@ def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
+    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
 ) -> MotionPlan:
     """A motion that grasps the object and lifts it.
 
     Args:
-        robot: Arm, hand and table.
+        robot: Arm, hand and table. Without a table, the level plane below the object counts as one.
         obj: A mesh, or a camera's cloud.
         T_world_object: Where it stands [m]; its frame is the world's by default.
         obstacles: Further things, in the world's frame, that nothing may touch.
@@ -123,19 +127,20 @@ def plan(
         config: How to plan.
         seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
         grasps: Complete grasps with scores, in the world's frame, instead of predicted ones; or what makes a batch from a seed.
+        start: Where the arm's joints are when the motion begins [rad or m]; home by default. The hand is open.
 
     Raises:
-        PlanError: The object or an obstacle collides with the robot at home, the object lies below the table, or no grasp can
-            be carried out; the message counts what was dropped where.
-        RobotError: The robot collides with the table at home.
-        OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, or the constraints leave nothing of the
-            object.
+        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, or no
+            grasp can be carried out; the message counts what was dropped where.
+        RobotError: The robot collides with the table, or with itself, at the start.
+        OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, the start is out of the joints' range, or
+            the constraints leave nothing of the object.
     """
     require_extra("arm")
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed)
+    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start)
     task.check_start()
     tries = Tries()
     for batch, last in candidates(task, tries, grasps, predictor):
@@ -164,18 +169,23 @@ class Task:
     config: PlanConfig
     constraints: Constraints  # Without obstacles, which the cell has
     seed: int
+    start: Float[np.ndarray, " n_arm"]  # Of the arm [rad or m]
 
     @staticmethod
     def of(
         robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
-        config: PlanConfig, seed: int,
+        config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
         obj, T = upright(obj, T_world_object)
+        if robot.table is None:
+            robot = replace(robot, table=table_below(robot, obj, T))
         if (scene := config.constraints.obstacles) is not None:
             reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
             obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
-        return Task(Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed)
+        first = robot.home if start is None else robot.require_start(start)
+        return Task(
+            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first)
 
     @property
     def robot(self) -> Robot:
@@ -211,20 +221,31 @@ class Task:
         top = float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
         if self.height is not None and top <= self.height:
             raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
-                            "the object in the robot's world frame (--camera, --pose), or correct `table` in the robot file")
+                            "the object in the robot's world frame (camera=..., pose=...), or correct `table` in the "
+                            "robot file")
         if self.distance > (longest := self.robot.longest_reach):
             raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "
                             f"hand are long ({longest:.2f} m); give its place in the robot's world frame [m]")
-        self.cell.refuse_contacts_at_home()
+        self.cell.refuse_contacts(self.start, "at home" if np.array_equal(self.start, self.robot.home) else "at the start")
 
     def advice(self, dropped: dict[str, int]) -> str:
         """What to change, by the reason for which most grasps were dropped."""
         reason = max(dropped, key=lambda r: dropped[r], default="")
         if reason in (TURNED, SPARED, BESIDE, NARROW):
             return (f"most grasps are {reason}; relax max_tilt, contact_region, keep_out or pregrasp_clearance, or ask for "
-                    "more grasps (--num)")
+                    "more grasps (num=...)")
         return (f"the object stands {self.distance:.2f} m from the base, and most grasps are {reason}; move the object, ask "
-                "for more grasps (--num), or for other palm directions (--directions)")
+                "for more grasps (num=...), or for other palm directions (directions=...)")
+
+
+def table_below(robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> Table:
+    """What an object stands on where nothing else is known: a level square below it, which leaves room for the arm's base."""
+    points = obj.cloud @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+    middle = (low[:2] + high[:2]) / 2
+    room = float(np.abs(middle - robot.T_world_base[:2, 3]).max()) - BASE_ROOM
+    half = max(float((high[:2] - low[:2]).max()) / 2 + SURROUNDS, min(room, ASSUMED_EXTENT / 2))
+    return Table(float(low[2]), (float(middle[0]), float(middle[1])), (2 * half, 2 * half))
 
 
 @dataclass
@@ -366,7 +387,7 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
         asked, seconds = (left[:1], config.best_seconds) if best else (left, config.planner_seconds)
         standoffs = np.array([goal.approach[0] for goal in asked])
         with tries.watch("path"):
-            path = find_path(robot.home, standoffs, lambda q: task.cell.free(q, opened), *robot.working_range, seconds,
+            path = find_path(task.start, standoffs, lambda q: task.cell.free(q, opened), *robot.working_range, seconds,
                              seed) if asked else None
         if path is not None:
             waypoints, reached = path

@@ -6,10 +6,10 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -17,7 +17,7 @@ import torch
 import yaml
 from jaxtyping import Float
 
-from dro_grasp.errors import HandError, RobotError
+from dro_grasp.errors import HandError, OptionError, RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rendering.rasterizer import Camera
@@ -32,7 +32,10 @@ from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import flat
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
+HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
+Read = TypeVar("Read")
 POSE_KEYS = {"position", "quaternion_wxyz"}  # What a robot file states of a pose
+FARTHEST_MOUNT = 2.0  # Largest distance of a hand from the link that carries it [m] (ours)
 TURN = np.pi  # Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)
 
 
@@ -113,6 +116,21 @@ class Robot:
     def working_range(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_arm"]]:
         """The joints' limits, and at most TURN from home."""
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
+
+    def require_start(self, start: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n_arm"]:
+        """Joints of the arm at which a motion may begin [rad or m]; OptionError: they are others, or out of range."""
+        found, names = np.asarray(start, np.float64), ", ".join(self.arm_joints)
+        if found.shape != self.home.shape:
+            raise OptionError(f"start has {found.size} values; robot '{self.name}' has {len(self.home)} arm joints: {names}")
+        for name, q, *limits, low, high in zip(
+            self.arm_joints, found, self.lower, self.upper, *self.working_range, strict=True):
+            if not limits[0] <= q <= limits[1]:
+                raise OptionError(f"start puts joint '{name}' at {q:.4g}, outside its limits {limits[0]:.4g} to "
+                                  f"{limits[1]:.4g}; give radians or metres in the order {names}")
+            if not low <= q <= high:
+                raise OptionError(f"start puts joint '{name}' at {q:.4g}, more than half a turn from `home`, and plans stay "
+                                  f"within {low:.4g} to {high:.4g}; turn it back, or state another `home`")
+        return found
 
     @property
     def open_hand(self) -> Float[np.ndarray, " n_dof"]:
@@ -215,25 +233,61 @@ def load_robot(name: str | Path) -> Robot:
         HandError: The hand cannot be used.
     """
     file = _RobotFile(locate_robot(name))
-    hand = locate_hand(file.hand)
-    within = hand.link if hand.path.resolve() == file.arm.resolve() else None
-    mount = file.mount.get("link", within)
-    if mount is None:
-        raise RobotError(f"{file.path} lacks the entry 'mount'; state where the hand sits, or, if the arm's file has the hand, "
-                         f"give it as a part of that: hand: {named(file.arm.name, 'LINK')}")
+    with file.faults as faults:  # all at once, since each would cost its reader a round
+        hand = locate_hand(file.hand)
+        within = hand.link if hand.path.resolve() == file.arm.resolve() else None
+        arm = _load_arm(file, within)
+        fit = _Fit(file, arm, str(file.mount.get("link", within)))
+        if "link" in file.mount or within is not None:
+            faults.of(fit.check_tree, None)
+        elif not file.mount:
+            faults.found.append(f"the file lacks the entry 'mount'; state where the hand sits, or, if the arm's file has the "
+                                f"hand, give it as a part of that: hand: {named(file.arm.name, 'LINK')}")
+        none = np.zeros(len(fit.joints))
+        lower, upper = faults.of(fit.positions, (none - np.inf, none + np.inf))
+        home = faults.of(lambda: fit.home(lower, upper), none)
+        velocity, acceleration, effort = (
+            faults.of(lambda kind=kind, usual=usual: fit.limit(kind, usual), none)
+            for kind, usual in (("velocity", None), ("acceleration", None), ("effort", 50.0)))
+    return Robot(
+        file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base, home, lower, upper, velocity,
+        acceleration, effort, file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+
+
+def _load_arm(file: _RobotFile, within: str | None) -> Description:
     try:
-        arm = load_description(file.arm, within, arm=True)
+        return load_description(file.arm, within, arm=True)
     except HandError as error:
         path = str(file.arm)
         reason = path.join(re.sub(r"\bhand\b", "robot", part) for part in str(error).split(path))
         raise file.error(f"the arm cannot be used: {reason}") from error
-    fit = _Fit(file, arm, str(mount))
-    fit.check_tree()
-    lower, upper = fit.positions()
-    return Robot(
-        file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base,
-        fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
-        fit.limit("effort", 50.0), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+
+
+class Faults:
+    """Collects what is wrong with a robot file, and says it all at the end of its block."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.found = path, list[str]()
+
+    def of(self, read: Callable[[], Read], otherwise: Read) -> Read:
+        """What is read; another value, with the fault noted, where that is refused."""
+        try:
+            return read()
+        except RobotError as error:
+            self._note(error)
+            return otherwise
+
+    def _note(self, error: RobotError) -> None:
+        self.found.append(str(error).removeprefix(f"{self.path}: "))
+
+    def __enter__(self) -> Faults:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
+        if isinstance(error, RobotError):
+            self._note(error)
+        if self.found and (error is None or isinstance(error, RobotError)):
+            raise RobotError(f"{self.path}: {'; '.join(dict.fromkeys(self.found))}") from error
 
 
 class _RobotFile:
@@ -246,21 +300,35 @@ class _RobotFile:
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
         known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table"}
-        values = self.mapping(values, "the file", known, {"arm", "hand", "home"})
+        values = self.mapping(values, "the file", known, {"arm", "hand"})
         self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
         hand = str(values["hand"])
         file, link = split_part(str(path.parent / hand))
-        self.hand = named(file, link) if Path(file).is_file() else hand
-        self.mount = self.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"}) if "mount" in values else {}
-        self.T_link_wrist = self.pose(self.mount, "mount")
-        self.T_world_base = self.pose(self.mapping(values.get("base", {}), "base", POSE_KEYS), "base")
-        home = self.mapping(values["home"], "home")
-        self.home = {str(k): self.number(v, f"home of joint {k}") for k, v in home.items()}
-        self.limits = self.mapping(values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"})
-        hand_limits = self.mapping(values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"})
-        self.hand_velocity = self.positive(hand_limits.get("velocity", 2.0), "hand_limits: velocity")
-        self.hand_acceleration = self.positive(hand_limits.get("acceleration", 10.0), "hand_limits: acceleration")
-        self.camera, self.table = self._camera(values.get("camera")), self._table(values.get("table"))
+        self.hand = named(file, link) if given_path(file).is_file() else hand
+        faults = self.faults = Faults(path)
+        self.mount = faults.of(lambda: self._mount(values), {"faulty": True})
+        self.T_link_wrist = faults.of(lambda: self.pose(self.mount, "mount", FARTHEST_MOUNT), np.eye(4))
+        self.T_world_base = faults.of(
+            lambda: self.pose(self.mapping(values.get("base", {}), "base", POSE_KEYS), "base"), np.eye(4))
+        self.home = faults.of(lambda: self._home(values.get("home")), None)
+        self.limits = faults.of(lambda: self.mapping(
+            values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"}), {})
+        hand_limits = faults.of(lambda: self.mapping(
+            values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"}), {})
+        self.hand_velocity, self.hand_acceleration = (
+            faults.of(lambda kind=kind, usual=usual: self.positive(hand_limits.get(kind, usual), f"hand_limits: {kind}"), usual)
+            for kind, usual in (("velocity", 2.0), ("acceleration", 10.0)))
+        self.camera = faults.of(lambda: self._camera(values.get("camera")), None)
+        self.table = faults.of(lambda: self._table(values.get("table")), None)
+
+    def _mount(self, values: dict[Any, Any]) -> dict[Any, Any]:
+        return self.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"}) if "mount" in values else {}
+
+    def _home(self, stated: Any) -> dict[str, float] | None:
+        """Home by joint; None where the file leaves it to a key of the arm's file."""
+        if stated is None:
+            return None
+        return {str(k): self.number(v, f"home of joint {k}") for k, v in self.mapping(stated, "home").items()}
 
     def error(self, text: str) -> RobotError:
         return RobotError(f"{self.path}: {text}")
@@ -271,7 +339,7 @@ class _RobotFile:
         if known is not None and (extra := [k for k in value if k not in known]):
             raise self.error(f"{what} has an entry '{extra[0]}'; known are {', '.join(sorted(known))}")
         if missing := sorted((needed or set()) - set(value)):
-            raise self.error(f"{what} lacks the entry '{missing[0]}'")
+            raise self.error(f"{what} lacks the {'entries' if missing[1:] else 'entry'} {_quoted(missing)}")
         return value
 
     def number(self, value: Any, what: str) -> float:
@@ -289,9 +357,11 @@ class _RobotFile:
             raise self.error(f"{what} is {value!r}; expected {count} numbers in brackets")
         return [self.number(v, what) for v in value]
 
-    def pose(self, values: dict[str, Any], what: str) -> Float[np.ndarray, "4 4"]:
+    def pose(self, values: dict[str, Any], what: str, farthest: float = np.inf) -> Float[np.ndarray, "4 4"]:
         T = np.eye(4)
         T[:3, 3] = self.numbers(values.get("position", [0, 0, 0]), f"{what}: position", 3)
+        if (far := float(np.linalg.norm(T[:3, 3]))) > farthest:
+            raise self.error(f"{what}: position is {far:g} m off, as of millimetres; expected at most {farthest:g} m")
         wxyz = np.array(self.numbers(values.get("quaternion_wxyz", [1, 0, 0, 0]), f"{what}: quaternion_wxyz", 4))
         if abs(float(np.linalg.norm(wxyz)) - 1) > 1e-3:
             raise self.error(f"{what}: quaternion_wxyz has length {np.linalg.norm(wxyz):g}; expected 1")
@@ -345,6 +415,10 @@ class _RobotFile:
         return Table(self.number(values.get("height", 0.0), "table: height"), (x, y), (length, width))
 
 
+def _quoted(names: Sequence[str]) -> str:
+    return " and ".join(f"'{name}'" for name in names)
+
+
 def _is_number(value: Any) -> bool:
     """Whether an entry of a robot file is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
@@ -377,6 +451,11 @@ class _Fit:
         """Limits of the joints: the file's, or else the arm's."""
         stated = self._by_joint("position", self.file.limits.get("position", {}))
         unlimited = {note.subject for note in self.arm.notes if note.text.startswith(NO_LIMITS)}
+        if missing := [name for name in self.joints if name in unlimited and name not in stated]:
+            entries = ", ".join(f"{name}: [-3.1, 3.1]" for name in missing)
+            raise self.error(f"{_joints(missing)} of the arm {_have(missing)} no position limits; state them in the "
+                             f"arm's file, or here: "
+                             f"limits: {{position: {{{entries}}}}}")
         lower, upper = (t.double().numpy().copy() for t in (self.tree.lower, self.tree.upper))
         for i, name in enumerate(self.joints):
             if name in stated:
@@ -387,9 +466,6 @@ class _Fit:
                 lower[i], upper[i] = ends
                 if np.abs(ends).max() > MAX_TURN:
                     raise self.error(f"limits: position of joint '{name}' is {ends}, which looks like degrees: expected rad")
-            elif name in unlimited:
-                raise self.error(f"joint '{name}' of the arm has no position limits; state them in the arm's file, or here: "
-                                 f"limits: {{position: {{{name}: [-3.1, 3.1]}}}}")
         return lower, upper
 
     def limit(self, kind: str, default: float | None = None) -> Float[np.ndarray, " n"]:
@@ -398,24 +474,29 @@ class _Fit:
         if given is not None and not isinstance(given, dict):
             given = dict.fromkeys(self.joints, given)
         values = {**stated, **self._by_joint(kind, given or {})}
+        if missing := [name for name in self.joints if values.get(name, default) is None]:
+            raise self.error(f"{_joints(missing)} of the arm {_have(missing)} no {kind} limit; state it in "
+                             f"{self.file.path.name}, for example limits: {{{kind}: 1.5}}, in rad/s or rad/s^2")
         for name in self.joints:
             value = values.get(name, default)
-            if value is None:
-                raise self.error(f"joint '{name}' of the arm has no {kind} limit; state it in {self.file.path.name}, for "
-                                 f"example limits: {{{kind}: 1.5}}, in rad/s or rad/s^2")
             if not _is_number(value) or value <= 0:
                 raise self.error(f"limits: {kind} of joint '{name}' is {value!r}; expected a number above 0")
         return np.array([float(values.get(name, default)) for name in self.joints])
 
     def home(self, lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """The home configuration, within the limits."""
-        home = self._by_joint("home", self.file.home)
+        stated = self.file.home if self.file.home is not None else _home_key(self.arm.path)
+        if stated is None:
+            raise self.error("the file lacks the entry 'home', and the arm's file has no key of this name; state it, "
+                             f"for example home: {{{', '.join(f'{name}: 0.0' for name in self.joints)}}}")
+        home = self._by_joint("home", stated) if self.file.home is not None else stated
         if missing := [n for n in self.joints if n not in home]:
-            raise self.error(f"home lacks joint '{missing[0]}'; the arm's joints are {', '.join(self.joints)}")
+            raise self.error(f"home lacks {_joints(missing)}; the arm's joints are {', '.join(self.joints)}")
         q = np.array([home[n] for n in self.joints])
         if len(out := np.flatnonzero((q < lower) | (q > upper))):
-            i = int(out[0])
-            raise self.error(f"home of joint '{self.joints[i]}' is {q[i]:g}, outside its limits {lower[i]:g} to {upper[i]:g}")
+            told = (f"home of joint '{self.joints[i]}' is {q[i]:g}, outside its limits {lower[i]:g} to {upper[i]:g}"
+                    for i in out)
+            raise self.error("; ".join(told))
         return q
 
     def _by_joint(self, what: str, values: Any) -> Mapping[str, Any]:
@@ -425,6 +506,26 @@ class _Fit:
             raise self.error(f"{what} names joint '{unknown[0]}', which the arm does not have; its joints are "
                              f"{', '.join(self.joints)}")
         return values
+
+
+def _joints(names: Sequence[str]) -> str:
+    return f"{'joints' if names[1:] else 'joint'} {_quoted(names)}"
+
+
+def _have(names: Sequence[str]) -> str:
+    return "have" if names[1:] else "has"
+
+
+def _home_key(path: Path) -> dict[str, float] | None:
+    """The key `home` of an MJCF file by joint; None where there is none."""
+    if parse_xml(path).tag == "robot":
+        return None
+    model = mujoco.MjModel.from_xml_path(str(path))
+    if (key := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, HOME_KEY)) < 0:
+        return None
+    single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    return {model.joint(i).name: float(model.key_qpos[key, model.jnt_qposadr[i]])
+            for i in range(model.njnt) if int(model.jnt_type[i]) in single}
 
 
 def _stated_limits(path: Path, kind: str) -> dict[str, float]:

@@ -65,7 +65,7 @@ class RobotReport:
         place = r.T_world_wrist(r.home)[:3, 3]
         of_arm = [pair for pair in self.excluded if not all(name.startswith(PREFIX) for name in pair)]
         between = [" and ".join(TABLE if name == WORLD else name.partition("/")[2] for name in pair) for pair in of_arm]
-        table = "no table, so that nothing keeps plans above one" if r.table is None else (
+        table = "no table: plans take the plane below the object for one" if r.table is None else (
             f"table at z = {r.table.height:g} m, {r.table.size[0]:g} x {r.table.size[1]:g} m")
         camera = "no camera" if r.camera is None else (
             "camera at ({:.2f}, {:.2f}, {:.2f}) m".format(*r.camera.T_world_camera[:3, 3]))

@@ -18,7 +18,7 @@ from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.perception.scan import given_points, given_pose, scanned_object
-from dro_grasp.objects.reading import numbers
+from dro_grasp.objects.reading import numbers, returned
 from dro_grasp.objects.shape import ObjectModel
 
 THICKNESS = 0.006  # Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)
@@ -79,17 +79,17 @@ def pick_object(
     if robot.table is None:
         raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
                          "object's points alone")
-    given, T = given_points(points, name), None if T_world_camera is None else given_pose(T_world_camera)
+    given, T = given_points(points, name)[:, :3], None if T_world_camera is None else given_pose(T_world_camera)
     wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
     if wanted is not None and wanted.shape != (len(given),):
         raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")
-    finite = np.isfinite(given).all(1)
+    finite = returned(given)
     sight = sort_out(
         given[finite], np.eye(4) if T is None else T, robot.table, near, None if wanted is None else wanted[finite])
     if len(sight.places) > 1 and near is None and mask is None:
         places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in sight.places)
         raise ObjectError(f"'{name}' has {len(sight.places)} things that stand on the table, at {places} m; say which one is "
-                          "wanted by a place near it (--near X Y), or give its points alone")
+                          "wanted by a place near it (near=(X, Y)), or give its points alone")
     height = sight.table_height
     level = replace(robot, table=replace(robot.table, height=height))
     if T is None:

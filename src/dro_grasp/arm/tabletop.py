@@ -471,8 +471,8 @@ def _done(
         source, sha256, solid = objects.get(a.object, ("", a.object_sha256, a.solid_sha256))
         if (a.object_sha256, a.solid_sha256) != (sha256, solid):
             raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
-                              f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with its own --output "
-                              "and --plans")
+                              f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with another "
+                              "output=... and plans=...")
     return {(a.object, a.number): a for a in done}, {source: name for name, (source, *_) in objects.items()}
 
 
@@ -485,7 +485,7 @@ def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
         if obj.solid_sha256 != solid:
             raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
                               "and plans are stored; rename one of the files, or attempt them apart, each with its own "
-                              "--output and --plans")
+                              "output=... and plans=...")
     return found
 
 

@@ -63,6 +63,10 @@ class Contact:
             f"{1e3 * self.distance:.1f} mm apart, where {1e3 * CLEARANCE:g} mm are kept")
 
 
+ELSEWHERE = {"at home": "give another `home`", "at the start": "begin elsewhere (start=...)"}
+"""What to do where something touches the robot as it begins."""
+
+
 class Workcell:
     """A robot, its table, obstacles, and the object that it grasps.
 
@@ -117,30 +121,31 @@ class Workcell:
         """The configuration that was checked last."""
         return mujoco.MjData(self.model)
 
-    def refuse_contacts_at_home(self) -> None:
-        """Refuse to start where something touches the robot.
+    def refuse_contacts(self, start: Float[np.ndarray, " n_arm"], where: str = "at home") -> None:
+        """Refuse to start where something touches the robot; `where` says so in words.
 
         Raises:
             PlanError: The object or an obstacle touches it.
             RobotError: The table, or another link, does.
         """
-        met = self.contacts(self.robot.home, self.robot.open_hand, CLEARANCE)
+        met = self.contacts(start, self.robot.open_hand, CLEARANCE)
         for contact in sorted(met, key=lambda contact: contact.distance)[:1]:
             link, other = sorted((contact.first, contact.second), key=lambda name: name in (TARGET, OBSTACLE, TABLE))
             if other == TARGET and self.target is not None:
-                raise PlanError(f"object '{self.target.name}' collides with {link} while the robot is at home; give its place "
-                                "in the robot's world frame, or another home")
+                raise PlanError(f"object '{self.target.name}' collides with {link} while the robot is {where}; give its place "
+                                f"in the robot's world frame, or {ELSEWHERE[where]}")
             if other == OBSTACLE:
-                pairs, distance = self._detect(self.robot.home, self.robot.open_hand, None)
+                pairs, distance = self._detect(start, self.robot.open_hand, None)
                 bad = pairs[self._bad(pairs, distance, CLEARANCE, False, False)].ravel().tolist()
                 geoms = [self.model.geom(geom).name for geom in bad if self._name(geom) == OBSTACLE]
                 numbers = sorted({int(name.split("solid")[1].split(".")[0]) for name in geoms})
                 names = ", ".join(f"'{self.obstacles[number].name}'" for number in numbers)
-                raise PlanError(f"obstacle {names} collides with {link} while the robot is at home, "
+                raise PlanError(f"obstacle {names} collides with {link} while the robot is {where}, "
                                 f"{contact.depth}; cut the robot out of that cloud or mesh, correct its place in the robot's "
-                                "world frame, or give another home")
-            raise RobotError(f"robot '{self.robot.name}' collides at home: {link} and {other}, {contact.depth}; correct "
-                             "`table` in the robot file, the camera's pose if the table was found in a cloud, or `home`")
+                                f"world frame, or {ELSEWHERE[where]}")
+            raise RobotError(f"robot '{self.robot.name}' collides {where}: {link} and {other}, {contact.depth}; correct "
+                             "`table` in the robot file, the camera's pose if the table was found in a cloud, or "
+                             f"{ELSEWHERE[where]}")
 
     def contacts(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = 0.0,

@@ -70,7 +70,7 @@ class Evaluate:
         with progress_bar("evaluating", self.json) as progress:
             while problems:  # what an object gathers in its trials goes with it
                 name, problem, part = problems.pop(0)
-                done = evaluate(problem, part, rules, progress)
+                done = evaluate(problem, part, rules, progress, another=self.object is not None)
                 evaluated[name] = with_contacts(hand, problem.obj, done, rules) if self.contact_quality else done
         if self.output is not None:
             GraspBatch.concatenate([*evaluated.values(), *bare.values()]).save(self.output)

@@ -84,8 +84,32 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
-        begin = time.perf_counter()
         from dro_grasp.errors import DroGraspError
+
+        with progress_bar("loading libraries, hand and weights", self.json):
+            names, outputs, pictures, job = self._prepare()
+        several = names != [self.object]
+        done, failed = [], []
+        for name, output, picture in zip(names, outputs, pictures, strict=True):
+            try:
+                done.append(self._grasp(job, name, output, picture))
+            except DroGraspError as error:
+                if not several:
+                    raise
+                say_aside(f"error: {name}: {error}")
+                failed.append({"object": name, "error": str(error)})
+        if self.json:
+            print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
+        if self.view:
+            from dro_grasp.apps.viewer.grasp_page import view_grasps
+
+            for d in (d for d in done if len(d.grasps)):
+                view_grasps(job.hand, d.obj, d.grasps, d.predicted_points)
+        return 2 if failed else 0
+
+    def _prepare(self) -> tuple[list[str], list[Path | None], list[Path | None], Job]:
+        """Names of the objects, where their files and pictures go, and what they share; libraries take seconds to load."""
+        begin = time.perf_counter()
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
@@ -109,24 +133,7 @@ class Generate:
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
-        job = Job(hand, predictor, request, constraints, camera, seconds)
-        done, failed = [], []
-        for name, output, picture in zip(names, outputs, pictures, strict=True):
-            try:
-                done.append(self._grasp(job, name, output, picture))
-            except DroGraspError as error:
-                if not several:
-                    raise
-                say_aside(f"error: {name}: {error}")
-                failed.append({"object": name, "error": str(error)})
-        if self.json:
-            print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
-        if self.view:
-            from dro_grasp.apps.viewer.grasp_page import view_grasps
-
-            for d in (d for d in done if len(d.grasps)):
-                view_grasps(hand, d.obj, d.grasps, d.predicted_points)
-        return 2 if failed else 0
+        return names, outputs, pictures, Job(hand, predictor, request, constraints, camera, seconds)
 
     def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
@@ -137,7 +144,8 @@ class Generate:
         from dro_grasp.simulation.outcome import count_failures, next_steps
 
         begin = time.perf_counter()
-        obj = self._load(name, job.camera)
+        with progress_bar(f"reading {Path(name).name}", self.json):
+            obj = self._load(name, job.camera)
         seconds = {**job.seconds, "load": job.seconds["load"] + time.perf_counter() - begin}
         if self.only_successful and self._protocol(obj) == "none":
             raise OptionError(f"--only-successful saves what passed a trial, and '{obj.name}' gets none; name a "
@@ -147,6 +155,7 @@ class Generate:
         if (warning := self._warning(job, obj)) is not None:
             say_aside(f"warning: {obj.name}: {warning}")
         problem = GraspProblem(job.hand, obj, self.device, job.constraints)
+        self._cut(obj)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
         if made.shortage is not None:
@@ -181,12 +190,22 @@ class Generate:
 
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept, picture)
-        seconds["files"] = time.perf_counter() - middle
-        seconds["total"] = sum(job.seconds.values()) + time.perf_counter() - begin
+        seconds |= {"files": time.perf_counter() - middle, "total": sum(job.seconds.values()) + time.perf_counter() - begin}
         report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)
         return ObjectResult(report, obj, kept, points)
+
+    def _cut(self, obj: ObjectModel) -> None:
+        """Cut a mesh into convex parts, which may take most of a minute the first time; says what comes of it."""
+        if obj.is_cloud:
+            return
+        said = set(obj.notes)
+        with progress_bar(f"cutting {obj.name} into convex parts, at most [s]", self.json) as progress:
+            obj.cut(progress)
+        for note in obj.notes:
+            if note not in said:
+                say_aside(f"{obj.name}: {note}")
 
     def _say_that_none_is_left(self, name: str, output: Path | None, picture: Path | None) -> None:
         """Say what comes of it that no grasp succeeded, of all that was asked for."""

@@ -22,6 +22,7 @@ from dro_grasp.cli.listing import Hands, Objects, Weights
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.output import say_aside
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
+from dro_grasp.cli.switches import in_switches
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
@@ -163,7 +164,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {in_switches(str(error))}", file=sys.stderr)
         return BAD_INPUT
     except Exception as error:  # the end of the program: whatever gets here is a fault of ours, and told as one
         if verbose:

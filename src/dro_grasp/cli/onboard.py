@@ -23,7 +23,7 @@ class Onboard:
     output: Path  # Folder for data, weights and report. A rerun resumes there.
     objects: tuple[str, ...] = ("builtin:train",)  # Objects to synthesize grasps of: names, meshes, folders or groups.
     held_out: tuple[str, ...] = ("builtin:test",)  # Objects to evaluate the weights on, never used in training.
-    minutes: float = 30.0  # Total time for data, training and trials [min].
+    minutes: float = 30.0  # Time for data, training and trials [min]; trials are not cut off when it is over.
     num: int = 20  # Grasps of the network evaluated on each held-out object; of what `generate` returns, a quarter as many.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights to fine-tune.
     source: str = "auto"

@@ -13,6 +13,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from dro_grasp.cli.switches import in_switches
+
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
 
@@ -23,12 +25,12 @@ SHORT = 12  # Letters of the name of a source up to which it is not broken
 
 def say(text: str) -> None:
     """Print one line to stdout without wrapping, so that paths stay whole."""
-    stdout.print(text, soft_wrap=True)
+    stdout.print(in_switches(text), soft_wrap=True)
 
 
 def say_aside(text: str) -> None:
     """Print one line to stderr without wrapping."""
-    stderr.print(text, soft_wrap=True)
+    stderr.print(in_switches(text), soft_wrap=True)
 
 
 def print_json(values: dict[str, Any]) -> None:
@@ -98,8 +100,8 @@ def _cell(value: Any) -> str:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar on stderr; the block calls its value with (done, total), or gets None if quiet."""
-    if quiet:
+    """A progress bar on stderr, if that is a terminal; the block calls its value with (done, total), or gets None if quiet."""
+    if quiet or not stderr.is_interactive:
         yield None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -53,13 +53,14 @@ class Plan:
     scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
     of it."""
+    start: Annotated[tuple[float, ...] | None, optional("Q ...", "the robot's home")] = None
+    """Where the arm's joints are when the motion begins [rad or m], from the base on."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none. A robot
-    without a table has none."""
+    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
@@ -111,16 +112,17 @@ class Plan:
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
         if self.mass is not None:
             obj = with_mass(obj, self.mass)
-        if robot.table is None:
-            say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
-                      "`table` in the robot file")
         lowest = float((obj.cloud @ T_world_object[2, :3]).min() + T_world_object[2, 3])
+        if robot.table is None:
+            say_aside(f"robot '{robot.name}' states no table: the plane below {obj.name}, z = {lowest:.3f} m, is taken for "
+                      "one; state `table` in the robot file")
         if robot.table is not None and lowest > robot.table.height + FLOATS:
             say_aside(f"{obj.name} floats {lowest - robot.table.height:.2f} m above the table; if nothing holds it there, "
                       "say where it is (--camera, --pose, --at)")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        made = (make or plan)(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        made = (make or plan)(
+            robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start)
         written = self._write(made)
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
@@ -154,10 +156,11 @@ class Plan:
         from dro_grasp.errors import OptionError
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
+        from dro_grasp.geometry.table_plane import table_plane
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.loading import read_geometry
         from dro_grasp.objects.perception.scan import load_scan
-        from dro_grasp.objects.reading import read_points
+        from dro_grasp.objects.reading import coordinates, read_points, returned
 
         if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
             raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
@@ -173,8 +176,10 @@ class Plan:
             return PickedObject(load_scan(path, camera), [], robot), T
         if self.pose is None and self.at is None and robot.table is not None and path.is_file():
             found, unit = read_geometry(path)  # a table is larger than any object that is loaded
-            if isinstance(found, np.ndarray) and found.ndim == 2 and sees_table(found[:, :3] * unit, robot.table):
-                return pick_object(path.stem, found[:, :3] * unit, robot), T
+            if isinstance(found, np.ndarray):
+                found = coordinates(found, str(path)) * unit
+                if sees_table(found, robot.table) or table_plane(found[returned(found)]) is not None:
+                    return pick_object(path.stem, found, robot), T
         obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
@@ -184,8 +189,6 @@ class Plan:
                 robot = replace(robot, table=Table(0.0, self.at))
             assert robot.table is not None
             T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
-        elif obj.is_cloud and robot.table is not None and obj.table is not None:
-            return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
         return PickedObject(obj, [], robot), T
 
     def _camera(self, robot: Robot) -> Float[np.ndarray, "4 4"] | None:

@@ -42,7 +42,10 @@ class View:
     """Object to show first: a name in the file, or a mesh to use for the file's only object. Without a file: any object."""
     scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
     port: int = 8080  # Port to serve on; if it is taken, the next free one.
-    host: str = "127.0.0.1"  # Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network.
+    host: str = "127.0.0.1"
+    """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network and needs a token."""
+    token: Annotated[str | None, optional("TOKEN", "DRO_GRASP_TOKEN, or one made up for other machines")] = None
+    """Token that browsers must know; the address that is printed holds it."""
     attempt: int = 0  # Number of the attempt in the file to run again and show first.
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Robot to use instead of the one named in a plan or an attempt."""
@@ -57,15 +60,17 @@ class View:
         require_extra("apps")
         from dro_grasp.apps.viewer.scene_view import serve
 
+        token = self.token or os.environ.get(TOKEN) or None
         if self.file is not None and is_motion(self.file):
             require_extra("arm")
             from dro_grasp.apps.viewer.lift_page import lift_page
 
-            (show or serve)(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
+            (show or serve)(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host, token=token))
             return 0
         from dro_grasp.apps.viewer.studio import StudioServer
 
-        (show or serve)(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host))
+        (show or serve)(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host,
+                                      token))
         return 0
 
     def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:

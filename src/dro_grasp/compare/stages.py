@@ -194,7 +194,7 @@ def _evaluated(
     """Grasps after all trials."""
     if config.contact_quality:
         grasps = with_contacts(hand, obj, grasps)
-    results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
+    results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers, another=True) for rules in config.protocols)
     return EvaluatedGrasps(grasps, results, seconds, len(hand.fingers), candidates)
 
 

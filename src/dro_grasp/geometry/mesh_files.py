@@ -12,6 +12,10 @@ import trimesh
 
 MAX_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory
 
+POINTER = b"version https://git-lfs.github.com/spec/"  # How such files begin. Source: specification of Git LFS, version 1
+FETCH = "fetch the file itself: git lfs pull, in its repository"
+"""What to do about a pointer."""
+
 
 def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
     """What trimesh reads from a file, without materials and textures; each reader behind it raises its own errors."""
@@ -22,8 +26,19 @@ def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
         return trimesh.load(content, kind, skip_materials=True, resolver=Beside(path.parent), **options)
 
 
+def is_pointer(path: Path) -> bool:
+    """Whether a file is the note that Git LFS leaves in place of one that was not fetched; what cannot be read is none."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(POINTER)) == POINTER
+    except OSError:
+        return False
+
+
 def check_bytes(path: Path) -> None:
-    """Refuse a file that is too large, or an archive that unpacks to too much, by a ValueError."""
+    """Refuse a file that is too large, an archive that unpacks to too much, or a pointer of Git LFS, by a ValueError."""
+    if is_pointer(path):
+        raise ValueError(f"it is a pointer of Git LFS; {FETCH}")
     size = path.stat().st_size
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:

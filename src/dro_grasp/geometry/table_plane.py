@@ -8,8 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
+from dro_grasp.geometry.point_groups import separate_groups
+
 THICKNESS = 0.006
 """Points nearer than this to the plane belong to it [m] (ours): about three standard deviations of a depth camera's noise."""
+BELOW = 0.02  # Largest share of the points that may lie below a wide table; below a small one, of those above (ours)
+WIDE = 0.08  # Area from which a plane is no wing or lid of an object of which parts stand on it [m^2] (ours)
 LEAST_REST = 16  # Fewest points above a table (ours)
 
 
@@ -29,9 +33,14 @@ def table_plane(
         plane, height = -plane, -height
     on, above, below = np.abs(height) <= THICKNESS, height > THICKNESS, height < -THICKNESS
     # The shares and the area are ours. A table is twice as large as what stands on it: an object's flat face is none.
-    if on.mean() < 0.3 or above.sum() < LEAST_REST or below.sum() > 0.02 * above.sum():
+    if on.mean() < 0.3 or above.sum() < LEAST_REST or below.mean() > BELOW:
         return None
-    return plane if _area(points[on], plane) > 2.0 * _area(points[above], plane) else None
+    area, standing = _area(points[on], plane), _area(points[above], plane)
+    if area > WIDE:  # several things, or scattered points, may stand all over it
+        standing = sum(_area(points[above][own], plane) for own in separate_groups(points[above]))
+    elif below.sum() > BELOW * above.sum():
+        return None
+    return plane if area > 2.0 * standing else None
 
 
 def above_plane(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> Bool[np.ndarray, " n"]:

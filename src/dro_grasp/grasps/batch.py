@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.errors import GraspFileError, ObjectError, OptionError
 from dro_grasp.files import check_output, given_path, reading, replacing
 from dro_grasp.grasps import columns, grasp_file
 from dro_grasp.grasps.columns import NOT_EVALUATED, REASON
@@ -336,6 +336,14 @@ class GraspBatch:
                 f"hand '{hand.name}' has {list(hand.tree.joint_names)}. Load the hand that the grasps name"
             )
 
+    def require_object(self, obj: ObjectModel) -> None:
+        """Refuse an object that has neither the name nor the content of that of these grasps: ObjectError."""
+        named = set(zip(self.object, self.object_sha256, strict=True))
+        other = [name for name, sha256 in named if name and sha256 and name != obj.name and sha256 != obj.sha256]
+        if other:
+            raise ObjectError(f"these grasps are for object '{min(other)}', and '{obj.name}' is another one; load the object "
+                              "that the grasps name, or say that you mean another (another=True)")
+
     def __repr__(self) -> str:
         return f"GraspBatch({sentence(self)})"
 
@@ -357,7 +365,7 @@ def load_grasps(path: Path | str) -> GraspBatch:
     path = given_path(path)
     batch = _folder(path) if path.is_dir() else GraspBatch.load(path)
     if len(batch) == 0:
-        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")
+        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without only_successful=True")
     return batch
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -29,6 +30,8 @@ MAY_BE_UNKNOWN = ("score", "energy", *CARRYING, *PER_JOINT)
 """Columns that say nothing about a grasp until somebody fills them; those of its trial are the others."""
 NOT_EVALUATED = ""  # Protocol of a grasp without a trial
 UNKNOWN_PROTOCOL = "unknown"  # Protocol of a grasp whose outcome is known without its protocol
+LABEL = re.compile(r"[\w.-]+(\+[\w.,=+-]+)?(/\d+)?(, [\w.-]+(\+[\w.,=+-]+)?(/\d+)?)*")
+"""How trials write their protocols: name, what differs from the protocol of this name, version; several after each other."""
 MEASURED = ("trial_success", "protocol", *TRIAL_FLOATS)  # Fields of a batch that a trial fills
 REASON = "reason"  # Further column: why a grasp failed, in words; empty for a success
 FAILURE = "failure"  # Further column: name of the kind of failure (`Failure`); None for a success
@@ -60,6 +63,13 @@ def require_fit(batch: Any, n_names: int) -> None:
         raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
     if bool((batch.trial_success & ~batch.evaluated).any()):
         raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
+
+
+def protocol_fault(protocol: Iterable[str]) -> str | None:
+    """What is wrong with the first protocol that no trial could have written; None if nothing is."""
+    wrong = next((name for name in set(protocol) if name != NOT_EVALUATED and not LABEL.fullmatch(name)), None)
+    return wrong and (f"protocol {wrong[:60]!r} is unknown; trials state a name and a version, such as carry/1, and names are "
+                      "of letters, digits, '_', '-' and '.'")
 
 
 def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:

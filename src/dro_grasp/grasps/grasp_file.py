@@ -212,7 +212,9 @@ SYNTHESIZED = re.compile(r"\bsynthesis \d+\b")
 
 
 def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
-    """Columns and header of a GraspBatch's file."""
+    """Columns and header of a GraspBatch's file; GraspFileError: no file could state its protocols."""
+    if (fault := columns.protocol_fault(batch.protocol)) is not None:
+        raise GraspFileError(f"{fault}; name it so before the grasps are saved")
     stored: dict[str, pa.Array] = {
         "object": pa.array(list(batch.object), pa.string()),
         "wrist_position": fixed_column(batch.T_object_wrist[:, :3, 3]),
@@ -261,6 +263,8 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     success = table["success"].to_pylist() if "success" in table.column_names else [None] * n
     protocol = tuple(columns.NOT_EVALUATED if s is None else p or columns.UNKNOWN_PROTOCOL
                      for p, s in zip(text("protocol"), success, strict=True))
+    if (fault := columns.protocol_fault(protocol)) is not None:
+        raise GraspFileError(f"{path}: {fault}; evaluate its grasps again, or write the file again")
     fields: dict[str, Any] = {name: text(name) for name in columns.TEXTS}
     fields |= {name: numbers(name, n_dof) for name in columns.PER_JOINT}
     fields |= {name: numbers(name, None) for name in columns.FLOATS}

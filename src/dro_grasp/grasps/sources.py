@@ -78,7 +78,7 @@ def require_pair(hand: Any, obj: Any) -> None:
 
 
 def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
-    """The hand of a file's grasps, or the given one; HandError: it is not found; the message asks for --hand."""
+    """The hand of a file's grasps, or the given one; HandError: it is not found; the message asks for `hand`."""
     from dro_grasp.hands.library import load_hand
 
     if given is not None:
@@ -88,7 +88,7 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
         return load_hand(source)
     except HandError as error:
         raise HandError(f"the grasps are of hand '{grasps.hand}', which cannot be loaded ({error}); give its file with "
-                        "--hand") from error
+                        "hand=...") from error
 
 
 def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float | None = None) -> ObjectModel:
@@ -130,13 +130,13 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMod
         return obj
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
-                          "with --object, and --scale if it had one") from error
+                          "with object=..., and scale=... if it had one") from error
 
 
 def require_one_object(grasps: GraspBatch, given: str | None, file: Path) -> None:
     """Refuse an object that is to stand for the one in a file, where the file has several: OptionError."""
     if given is not None and (number := len(list(grasps.by_object()))) > 1:
-        raise OptionError(f"{file} holds grasps of {number} objects; --object fits a file with one")
+        raise OptionError(f"{file} holds grasps of {number} objects; another object fits a file with one")
 
 
 def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
@@ -155,7 +155,7 @@ def recorded_mass(grasps: GraspBatch) -> float | None:
     known = [_as_given(mass) for mass in masses[masses.isfinite()]]
     if len(known) > 1 or (known and bool(column.isnan().any())):
         listed = " and ".join([f"{mass:g} kg" for mass in known] + ["none"] * bool(column.isnan().any()))
-        raise ObjectError(f"the grasps of '{grasps.object[0]}' were made for several masses, {listed}; state one with --mass, "
+        raise ObjectError(f"the grasps of '{grasps.object[0]}' were made for several masses, {listed}; state one (mass=...), "
                           "or give files that are of one mass each")
     return known[0] if known else None
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
-from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
+from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
 if TYPE_CHECKING:
     from dro_grasp.hands.description.tree_reading import LinkGeometry
@@ -30,6 +30,9 @@ FEWEST_WITH_THUMB = 4  # Hands with fewer fingers have no thumb: their fingers a
 THUMB_CLOSING = 0.55
 """Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
 every hand with four or five fingers, built in or among the development assets (ten hands)."""
+ABOUT_AS_OPPOSED = 0.25
+"""Opposition by which another finger may exceed the one that is named a thumb (ours). Of seven hands, thumbs exceed their
+fingers by 0.3 to 1.0."""
 MAX_FINGERS = 24  # Most fingers of a hand (ours): two hands of a humanoid, and its feet
 LONGEST_FINGER = 12
 """Most joints of one finger (ours): to find which way they close, every combination of their directions is tried."""
@@ -148,9 +151,15 @@ def measure_opposition(
     return -(direction * others).sum(-1)
 
 
-def find_thumb(opposition: Float[Tensor, " n_tips"]) -> int | None:
-    """The finger with the largest thumb opposition; None for hands with too few fingers to have a thumb."""
-    return None if len(opposition) < FEWEST_WITH_THUMB else int(opposition.argmax())
+def find_thumb(opposition: Float[Tensor, " n_tips"], named: int | None = None) -> int | None:
+    """The finger with the largest thumb opposition, or the one that is named so if it has about as much.
+
+    None for hands with too few fingers to have a thumb.
+    """
+    if len(opposition) < FEWEST_WITH_THUMB:
+        return None
+    most = int(opposition.argmax())
+    return most if named is None or float(opposition[most] - opposition[named]) > ABOUT_AS_OPPOSED else named
 
 
 def closing_gains(
@@ -190,6 +199,7 @@ LOOSE = 0.03
 some linkages only about. Of five grippers it is 0.014 at most; jaws that turn against each other about near axes have 0.09."""
 TURN = 0.1  # Least angle that two links turn about their pin [rad] (ours); with none, any point would do
 APART = 3e-3  # Least distance of a pin from the axes of the two links' own joints [m] (ours)
+IN_PLACE = 2e-3  # Speed of its middle below which a last link turns in place [m/rad or m/m] (ours)
 OUTSIDE = 5e-3  # Largest distance of a pin from the bounding boxes of both links [m] (ours)
 
 
@@ -201,7 +211,7 @@ class _End:
     link: int  # its topmost link, in whose frame the rest is
     vertices: Float[np.ndarray, "n 3"]  # corners of its shapes [m]
     anchor: Place  # a point on the axis of its joint [m]
-    axis: Place
+    axis: Place | None  # its direction; None for the three hinges of a ball joint
 
     def has(self, pin: Place) -> bool:
         """Whether a point is at this link."""
@@ -209,8 +219,8 @@ class _End:
         return bool(((pin >= low) & (pin <= high)).all())
 
     def lever(self, pin: Place) -> float:
-        """Distance of a point from the axis of this link's own joint [m]."""
-        return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
+        """Distance of a point from the axis of this link's own joint, or from the middle of its ball [m]."""
+        return float(np.linalg.norm(pin - self.anchor if self.axis is None else np.cross(pin - self.anchor, self.axis)))
 
 
 def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkGeometry]) -> dict[int, int]:
@@ -234,13 +244,38 @@ def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkG
     return {rod: _last(pinned, rod) for rod in pinned}
 
 
+def turn_in_place(tree: KinematicTree, ends: Sequence[int], geometry: Sequence[LinkGeometry]) -> set[int]:
+    """Ends whose middle no joint moves, as rotors of motors within a palm; none if fewer than two others would be left."""
+    places = []
+    for end in ends:
+        corners = np.concatenate([shape.vertices for shape in geometry if shape.link == end])
+        places.append((corners.min(0) + corners.max(0)) / 2)
+    poses, links = tree.forward((tree.lower + tree.upper) / 2), torch.tensor(ends)
+    points = se3.apply(poses[links], torch.from_numpy(np.stack(places)).float())
+    speed = tree.point_jacobian(poses, points, links).norm(dim=1).amax(1)
+    found = {end for end, moved in zip(ends, speed.tolist(), strict=True) if moved < IN_PLACE}
+    return found if len(ends) - len(found) > 1 else set()
+
+
 def _end(tree: KinematicTree, tip: int, poses: Float[np.ndarray, "n_links 4 4"], geometry: Sequence[LinkGeometry]) -> _End:
     group = rigid_groups(tree)
     link = group[tip]
     to_link = np.linalg.inv(poses[link])
     fixed = [(to_link @ poses[shape.link], shape.vertices) for shape in geometry if group[shape.link] == link]
     corners = np.concatenate([vertices @ T[:3, :3].T + T[:3, 3] for T, vertices in fixed])
-    return _End(tip, link, corners, tree.anchor[link].double().numpy(), tree.axis[link].double().numpy())
+    axis = None if _is_ball(tree, link) else tree.axis[link].double().numpy()
+    return _End(tip, link, corners, tree.anchor[link].double().numpy(), axis)
+
+
+def _is_ball(tree: KinematicTree, link: int) -> bool:
+    """Whether a link turns about three axes through one point."""
+    above = tree.parent[link]
+    for lower, upper in ((link, above), (above, tree.parent[above] if above >= 0 else -1)):
+        if upper < 0 or not tree.kind[lower] == tree.kind[upper] == REVOLUTE:
+            return False
+        if not torch.equal(tree.origin[lower], torch.eye(4)) or not torch.equal(tree.anchor[lower], tree.anchor[upper]):
+            return False
+    return True
 
 
 def _are_pinned(poses: Float[np.ndarray, "k n_links 4 4"], first: _End, second: _End) -> bool:

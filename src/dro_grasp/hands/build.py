@@ -175,7 +175,9 @@ class HandBuilder:
     def ends(self) -> tuple[int, ...]:
         """Fingertip links, and the ends of linkages' rods."""
         try:
-            return anatomy.find_tips(self.tree, self.shaped)
+            ends = anatomy.find_tips(self.tree, self.shaped)
+            rotors = anatomy.turn_in_place(self.tree, ends, self.description.geometry)
+            return tuple(end for end in ends if end not in rotors)
         except HandError as error:
             lost = [note.text for note in self.description.notes if note.level == "warning"]
             raise HandError("; ".join([str(error), *lost[:3]])) from error
@@ -260,16 +262,27 @@ class HandBuilder:
     @cached_property
     def closing(self) -> Closing:
         """From where and to where the joints close, and the palm."""
-        rest = self.rest.clamp(self.motion.tree.lower, self.motion.tree.upper)
-        finder = ClosingFinder(self.motion.tree, rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
-                               sideways=torch.zeros_like(self.movable))
-        found = finder.find()
+        finder, found = self.finder, self.finder.find()
         # Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
         if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(finder.tree.lower, finder.tree.upper) >= ROLLING_UP:
             with contextlib.suppress(HandError):  # nothing is enclosed so early
                 early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
                 return early if early.palm.score > found.palm.score + MUCH_BETTER else found
         return found
+
+    @cached_property
+    def finder(self) -> ClosingFinder:
+        """What the closing is derived from."""
+        rest = self.rest.clamp(self.motion.tree.lower, self.motion.tree.upper)
+        return ClosingFinder(self.motion.tree, rest, self.movable, self.stated, self.stated_ways, self.fingers, self.coarse,
+                             self.on_palm, sideways=torch.zeros_like(self.movable))
+
+    @cached_property
+    def stated_ways(self) -> Float[Tensor, " n_dof"]:
+        """+1 for joints that close by increasing, as the closed posture says that the file states, -1 for others; 0: unsaid."""
+        closed = torch.tensor([self.description.closed_posture.get(name, float("nan")) for name in self.tree.joint_names])
+        start = torch.where(self.stated.isnan(), (self.tree.lower + self.tree.upper) / 2, self.stated)
+        return torch.where(self.movable, (closed - start).nan_to_num(0.0).sign(), 0.0)
 
     @cached_property
     def stated(self) -> Float[Tensor, " n_dof"]:

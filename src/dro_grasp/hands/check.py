@@ -17,12 +17,14 @@ from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.closing import fixed_jaw_of
+from dro_grasp.hands.confidence import LOW, confidence, thumb_confidence
 from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
 from dro_grasp.hands.library import load_hand_description
+from dro_grasp.hands.names import named_side
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.usable_range import range_notes
 
@@ -30,8 +32,10 @@ TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
            "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
+DOUBT = (200, 20, 20)  # Colour of what a picture says of low confidence
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
+FEWEST_WITH_SIDE = 3  # Hands with fewer fingers are on no side, whatever they are called (ours)
 SAME_WAY = 0.9  # Cosine from which on jaws move the same way (ours)
 END = {1: "upper", -1: "lower"}  # Limit at which a joint is open, by opening sign
 THIN_VOLUME = 1e-9  # Volume below which a link's shapes enclose nothing [m^3] (ours)
@@ -60,7 +64,10 @@ class HandReport:
             first, *more = _words(value)
             told.append(f"{name.replace('_', ' '):<{width}}  {first}")
             told.extend(f"{'':<{width}}  {line}" for line in more)
-        found = [f"{note.level}: {note.subject}: {note.text}" for note in self.notes]
+        alike: dict[tuple[str, str], list[str]] = {}
+        for note in self.notes:
+            alike.setdefault((note.level, note.text), []).append(note.subject)
+        found = [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
         return [f"hand {self.hand.name}", *told, "", *(found or ["nothing wrong was found"])]
 
     def to_dict(self) -> dict[str, Any]:
@@ -81,9 +88,10 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *opening_notes(hand),
-             *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
-    return HandReport(hand, _facts(hand, description), (*description.notes, *found))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *_sliding_notes(hand), *_side_notes(hand),
+             *opening_notes(hand), *range_notes(hand), *effort_notes(hand), *_shape_notes(hand, description))
+    sure, doubts = confidence(hand, description)
+    return HandReport(hand, {**_facts(hand, description), "confidence": sure}, (*description.notes, *found, *doubts))
 
 
 def _facts(hand: Hand, description: Description) -> dict[str, Any]:
@@ -93,7 +101,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         f"{tree.moving_names[c.follower]} = {c.multiplier:g} * {tree.moving_names[c.leader]} + {c.offset:g}"
         if c.leader >= 0 else f"{tree.moving_names[c.follower]} = {c.offset:g}" for c in description.couplings
     ]
-    joints, movable = tree.joint_names, hand.movable.tolist()
+    joints, movable, opened = tree.joint_names, hand.movable.tolist(), hand.canonical_joints(1.0).tolist()
     return {
         "file": description.source,
         "wrist_link": hand.wrist_link,
@@ -109,7 +117,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "held_joints": [n for n, m in zip(joints, movable, strict=True) if not m],
         "coupled_joints": couplings,
         "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
-        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, hand.open_ends.tolist(), movable, strict=True) if m},
+        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, opened, movable, strict=True) if m},
         "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
         "effort": {n: round(x, 3) for n, x, m in zip(joints, find_efforts(hand).limit.tolist(), movable, strict=True) if m},
         "contact_links": [names[i] for i in hand.contact_links],
@@ -133,15 +141,37 @@ def _rigid_groups(hand: Hand) -> list[list[str]]:
 
 
 def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm."""
-    if hand.thumb is None:
-        return "none"
+    """`left`, `right`, or `none`: by its thumb, or else by the names of its links and its file."""
+    return seen_side(hand) or _side_in_names(hand) or "none"
+
+
+def seen_side(hand: Hand) -> str | None:
+    """The side that the thumb is on; None for a hand without a thumb or with fingers all around the palm."""
+    if hand.thumb is None or thumb_confidence(hand) < LOW:
+        return None
     tips, palm = FingerMotion.of(hand).tips(hand.canonical_joints(1.0)), hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
     # With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
-    return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+    return None if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+
+
+def _side_in_names(hand: Hand) -> str | None:
+    if len(hand.fingers) < FEWEST_WITH_SIDE:
+        return None
+    links = [hand.tree.link_names[i] for i in hand.contact_links]
+    file = () if hand.description is None or hand.description.link is not None else (hand.description.path.stem,)
+    return named_side(links, file)
+
+
+def _side_notes(hand: Hand) -> list[Note]:
+    """Names that tell of another side than the thumb."""
+    seen, named_so = seen_side(hand), _side_in_names(hand)
+    if seen is None or named_so in (None, seen):
+        return []
+    return [Note("warning", hand.tree.link_names[hand.palm], f"is that of a {named_so} hand by its names and of a {seen} hand "
+                 "by its thumb, which counts. Is the palm direction right?")]
 
 
 def _part_notes(hand: Hand, description: Description) -> list[Note]:
@@ -218,8 +248,16 @@ def picture(hand: Hand, path: Path | str) -> None:
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)
+    if doubts := _doubts(hand):
+        pen.text((width + 220, 6), f"low confidence: {doubts}", fill=DOUBT, font=font)
     with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
+
+
+def _doubts(hand: Hand) -> str:
+    """What of the hand is read with low confidence, in words."""
+    sure, _ = confidence(hand, hand.description) if hand.description else ({}, [])
+    return " and ".join({"palm": "palm direction"}.get(name, name) for name, value in sure.items() if value < LOW)
 
 
 def _camera(hand: Hand) -> Camera:

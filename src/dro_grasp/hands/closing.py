@@ -28,7 +28,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, FingerMotion, Line
+from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, ONE_WAY, Curl, FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -37,6 +37,7 @@ Place = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
 Mask = Bool[np.ndarray, " n"]
 GRID_SPACING = 0.008  # Spacing of candidate ball centres [m] (ours)
+GRID_CELLS = 200_000  # Number of them in a hand's box beyond which they lie farther apart (ours): that of a box of half a metre
 CLOSINGS = (0.35, 0.5, 0.65)  # Shares of the way from open to closed at which the hand is examined (ours)
 EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
 """Shares of the way from open to closed at which hands whose fingers may roll up are examined as well (ours)."""
@@ -49,8 +50,9 @@ NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, 
                     "axes and limits of its joints")
 """Error message."""
 LARGEST_BALL = 0.05  # Radius beyond which a larger empty ball is no better [m] (ours)
-NEARLY_CLOSED = (0.79, 0.8)
-"""Shares of the way from open to closed between which the jaw is looked for (ours). Closed all the way, jaws often overlap."""
+NEARLY_CLOSED = ((0.79, 0.8), (0.34, 0.35))
+"""Shares of the way from open to closed between which the jaw is looked for (ours). Closed all the way, jaws often overlap, and
+a finger of several joints curls past the jaw."""
 SLIDING = 0.1  # Difference in speed along a finger, as a share of its mean, below which it slides rather than turns (ours)
 KNUCKLE = 0.25  # Share of the finger beside which the jaw has not begun (ours)
 LEAST_LENGTH = 0.3  # Length of a jaw, as a share of the finger's, below which the palm has none (ours)
@@ -67,15 +69,21 @@ class Palm:
     score: float  # how well palm and fingers surround the ball [m]; higher is better
 
 
-def find_palm(palm_points: Points, palm_normals: Points, fingers: list[Float[np.ndarray, "_ 3"]]) -> Palm:
-    """The palm before which surface points [m] of palm and fingers enclose a ball best; HandError: they enclose nothing."""
+def find_palm(
+    palm_points: Points, palm_normals: Points, fingers: list[Float[np.ndarray, "_ 3"]], ahead: Place | None = None
+) -> Palm:
+    """The palm before which surface points [m] of palm and fingers enclose a ball best, on the side that is `ahead` if given.
+
+    HandError: they enclose nothing.
+    """
     everything = np.concatenate([palm_points, *fingers])
     try:
         hull = ConvexHull(everything)
     except QhullError as error:
         raise HandError(NOTHING_ENCLOSED) from error
     low, high = everything.min(0), everything.max(0)
-    axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
+    spacing = max(GRID_SPACING, float(np.prod(high - low) / GRID_CELLS) ** (1 / 3))
+    axes = [np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     planes = np.unique(hull.equations.round(6), axis=0)
     for some in np.array_split(planes, math.ceil(len(planes) / 32)):  # most centres fall to the first planes
@@ -83,6 +91,8 @@ def find_palm(palm_points: Points, palm_normals: Points, fingers: list[Float[np.
     tree = KDTree(palm_points)
     to_palm, nearest = map(np.asarray, tree.query(grid))
     outside = ((grid - palm_points[nearest]) * palm_normals[nearest]).sum(1) > 0.7 * to_palm
+    if ahead is not None:
+        outside &= (palm_normals @ ahead > AHEAD)[nearest]
     grid, to_palm, nearest = grid[outside], to_palm[outside], nearest[outside]
     if not len(grid):
         raise HandError(NOTHING_ENCLOSED)
@@ -143,10 +153,14 @@ def find_fixed_jaw(before: Points, points: Points, on_palm: Mask, on_finger: Mas
 
 def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     """The part of the palm that a hand's single finger closes on; None of several fingers."""
-    if len(hand.fingers) > 1:
+    if len(hand.fingers) != 1:
         return None
-    before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in NEARLY_CLOSED)
-    return find_fixed_jaw(before, after, *((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)))
+    parts = [(hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)]
+    for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in hand.fingers)]:
+        before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in shares)
+        if (jaw := find_fixed_jaw(before, after, *parts)) is not None:
+            return jaw
+    return None
 
 
 def _faster(points: Float[np.ndarray, "m 3"], speed: Float[np.ndarray, " m"]) -> Place | None:
@@ -169,6 +183,16 @@ ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
 AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
+MOST_UNSURE = 6  # Most fingers that bend as far back as forth of which all combinations of sides are tried (ours)
+FACING = 0.8
+"""Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Of 16 hands: 0.86 to 1."""
+TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
+LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
+EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
+CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
+DECIDES = 0.3
+"""Share of a finger's part in how much nearer fingertips come to each other from which on it tells where it closes (ours)."""
+NEARER = 1e-4  # Least amount of that, a sum of squared distances [m^2] (ours): one centimetre
 PATH = 65  # Postures on the way from closed to open at which a hand is examined (ours)
 AT_LIMIT = 0.1  # Distance to a limit, as a share of the range, within which a joint is at this limit (ours)
 
@@ -191,6 +215,7 @@ class ClosingFinder:
     rest: Joints  # as in `Hand`
     movable: JointMask  # as in `Hand`
     stated: Joints  # the open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing
+    stated_ways: Joints  # +1 for joints that close by increasing, as it states, -1 for others, 0 if it says nothing
     fingers: tuple[Finger, ...]
     coarse: LinkSurface  # some samples of every link from the palm on
     on_palm: Bool[np.ndarray, " n"]  # the samples on the palm
@@ -198,18 +223,30 @@ class ClosingFinder:
     closings: tuple[float, ...] = CLOSINGS  # shares of the way from open to closed at which the hand is examined
 
     def find(self) -> Closing:
-        """The closing between the limits, or from the widest posture of fingers that fold or bend back beyond it."""
+        """The closing between the limits, or from where fingers that fold or bend back beyond it are straight."""
         found = self.between_limits()
         if self.fixed_jaw(found.open_ends, found.opening_signs, found.abduction) is not None:
             return found
         if (sideless := self.without_side(found)) is not None:
             return sideless
-        folded = bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any())
-        other = self.spreading(found)
-        if not folded and bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()):
-            return other.unrolled(found)
-        straightened = other.straight_about(found)
-        return straightened or (self.from_widest() if folded else found)
+        folded = self.folded(found)
+        return self.unfolded(found, folded) if bool(folded.any()) else found
+
+    def unfolded(self, found: Closing, folded: Bool[Tensor, " n_tips"]) -> Closing:
+        """The closing of a hand some of whose fingers fold back: these open straight, and at their knuckles the widest."""
+        tree, of_folded = self.tree, self.tree.moves[self.motion.links][folded].any(0)
+        other = dataclasses.replace(self, sideways=self.spreading(found).sideways & of_folded)
+        abduction = (found.abduction | other.sideways) & self.movable
+        cut = of_folded & other.bending(abduction)
+        straight = torch.where(cut, self.straight, self.start)
+        knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
+        room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
+        half = dataclasses.replace(tree, lower=torch.where(opening > 0, tree.lower + room, tree.lower),
+                                   upper=torch.where(opening < 0, tree.upper - room, tree.upper))
+        axis = Line(_tensor(found.palm.centre), _tensor(found.palm.direction))
+        start = torch.where(knuckles, straight.clamp(half.lower, half.upper), straight)
+        widest = dataclasses.replace(self.motion, tree=half).widest(axis, start, knuckles)
+        return other.narrowed(cut, widest, opening)
 
     def spreading(self, found: Closing) -> ClosingFinder:
         """The same, but joints that move fingers sideways are taken to spread them."""
@@ -260,19 +297,6 @@ class ClosingFinder:
         back, forth = ways.amin(0), ways.amax(0)
         return self.bending(abduction) & self.motion.hinges(straight) & (back > FAR_BACK) & (back >= BOTH_WAYS * forth)
 
-    def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
-        """Least share of each finger's reach at the widest spread that it keeps on the way from there to its open ends."""
-        # The palm itself may have been found on the wrong side, so this takes none.
-        ends = torch.where(self.movable & ~found.abduction & ~self.sideways, found.open_ends, self.spread)
-        beyond = torch.stack([self.spread + share * (ends - self.spread) for share in torch.linspace(0, 1, PATH)])
-        return self.motion.kept(beyond, self.movable).amin(0)
-
-    @cached_property
-    def spread(self) -> Joints:
-        """The posture whose fingertips are farthest from the palm's middle [rad or m]."""
-        middle = Line(self.palm_middle, torch.zeros(3))
-        return self.motion.widest(middle, self.start, self.movable & self.stated.isnan() & ~self.sideways)
-
     @cached_property
     def start(self) -> Joints:
         """Joints at rest, or as the file states them [rad or m]."""
@@ -296,33 +320,6 @@ class ClosingFinder:
             out_of_palm = self.out_of_palm(self.opened(signs), signs, palm)
         assert palm is not None
         return Closing(signs, self.opened(signs), abduction & self.movable, palm)
-
-    def from_widest(self) -> Closing:
-        """The closing of fingers that start from their widest span."""
-        # Where fingers fold as far to one side of the palm as to the other, limits do not tell the sides apart. So the hand is
-        # spread as far from the palm's middle as it goes and closed to both sides.
-        tree = self.tree
-        signs, palm = self.better_side(self.spread)
-        abduction = self.out_of_palm(self.spread, signs, palm) & self.movable
-        widest = self.widest_about(palm, abduction)
-        centre = _tensor(palm.grasp_centre)
-        for _ in range(REFINEMENTS):
-            signs = self.signs_at_limits(signs, abduction, abduction, centre)
-        at_limits = Closing(signs, self.opened(signs), abduction, palm)
-        folded = tree.moves[self.motion.links][self.folded(at_limits)].any(0) & ~abduction
-        return self.narrowed(folded, widest, torch.where(folded, self.signs_from(widest, signs, abduction, centre), signs))
-
-    def unrolled(self, found: Closing) -> Closing:
-        """The closing of fingers that start from their widest span about the palm that was found, and all of which roll up."""
-        abduction = (found.abduction | self.sideways) & self.movable
-        widest = self.widest_about(found.palm, abduction)
-        signs = self.signs_from(widest, found.opening_signs, abduction, _tensor(found.palm.grasp_centre))
-        return self.narrowed(self.movable & ~abduction, widest, signs)
-
-    def widest_about(self, palm: Palm, abduction: JointMask) -> Joints:
-        """The posture whose fingertips are farthest from the palm's axis [rad or m]."""
-        axis = Line(_tensor(palm.centre), _tensor(palm.direction))
-        return self.motion.widest(axis, self.start, self.movable & ~abduction & self.stated.isnan())
 
     def narrowed(self, cut: JointMask, widest: Joints, signs: Joints) -> Closing:
         """The closing of a hand some of whose joints do not open beyond the widest posture."""
@@ -359,13 +356,14 @@ class ClosingFinder:
         """
         bases = (self.rest, self.posture(self.opened(signs), signs, abduction, 0.5))
         tips, targets = (self.motion.links, self.motion.tip_points), (centre, self.palm_middle)
-        gains = torch.stack([closing_gains(self.tree, q, *tips, targets) for q in bases]).sum(0)
+        gains = self.curled(torch.stack([closing_gains(self.tree, q, *tips, targets) for q in bases]).sum(0))
         signs = torch.where((gains >= 0) | spreads, -1.0, 1.0)
         # A single finger closes on the jaw that is part of the palm, if there is one on either side.
         jaw, other = (self.fixed_jaw(self.opened(way), way, abduction) for way in (signs, -signs))
         signs = signs if other is None or (jaw and jaw.length >= other.length) else -signs
         # A joint whose stated open posture is a limit opens towards it.
-        return torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
+        signs = torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
+        return torch.where(self.stated_ways == 0, signs, -self.stated_ways)
 
     def signs_from(self, widest: Joints, signs: Joints, abduction: JointMask, centre: Point) -> Joints:
         """Opening signs of joints that start from the widest posture: those that close each fingertip on the grasp centre."""
@@ -377,18 +375,67 @@ class ClosingFinder:
             choices = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * len(joints)).reshape(-1, len(joints))
             tried = signs.repeat(len(choices), 1)
             tried[:, joints] = choices
-            tried = self.away_from_limits(widest, tried)
+            tried = self.away_from_limits(widest, torch.stack([-self.curled(-row) for row in tried]).unique(dim=0))
             postures = torch.cat([self.posture(widest, tried, abduction, share) for share in CLOSINGS])
             distance = (self.motion.tips(postures) - centre).norm(dim=-1).sum(-1).unflatten(0, (len(CLOSINGS), -1)).sum(0)
             signs = tried[int(distance.argmin())]
         return signs
+
+    def curled(self, gains: Joints) -> Joints:
+        """What each joint gains by increasing, but hinges of one finger close together, to the side to which it curls."""
+        for curl, side in zip(*self.sides, strict=True):
+            total = side if side else float((gains * curl.ways).sum())
+            gains = torch.where(curl.ways != 0, curl.ways * total, gains)
+        return gains
+
+    @cached_property
+    def sweep(self) -> Place | None:
+        """The direction in which straight fingers begin to close [unit vector], if they do it alike."""
+        curls, sides = self.sides
+        closing = torch.stack([curl.ways * side for curl, side in zip(curls, sides, strict=True)])
+        moved = (self.motion.velocities(self.straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
+        way = torch.nn.functional.normalize(moved, dim=-1).mean(0) if len(moved) else torch.zeros(3)
+        return _unit(way.double().numpy()) if len(moved) >= LEVEL_FINGERS and float(way.norm()) > TOGETHER else None
+
+    @cached_property
+    def straight(self) -> Joints:
+        """Straight fingers [rad or m]."""
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        if not bool(bends.any()):
+            return self.start
+        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT)
+
+    @cached_property
+    def sides(self) -> tuple[list[Curl], list[float]]:
+        """How each finger curls, and where it closes: 1 to where it bends farther, -1 to the other side, 0 where nothing tells.
+
+        Fingers that bend as far back as forth close to where fingertips meet.
+        """
+        straight, curls = self.straight, self.motion.curls(self.straight, self.movable & ~self.sideways)
+        said = [float((curl.ways * self.stated_ways).sum()) for curl in curls]
+        sides = [math.copysign(1.0, way) if way else float(curl.back < ONE_WAY) for way, curl in zip(said, curls, strict=True)]
+        unsure = [i for i, curl in enumerate(curls) if not sides[i] and bool(curl.ways.any())]
+        if not 0 < len(unsure) <= MOST_UNSURE:
+            return curls, sides
+        choices = torch.cartesian_prod(*[torch.tensor([1.0, -1.0])] * len(unsure)).reshape(-1, len(unsure))
+        tried = torch.tensor(sides).repeat(len(choices), 1)
+        tried[:, unsure] = choices
+        ways = tried @ torch.stack([curl.ways for curl in curls])
+        closed = torch.where(ways > 0, self.tree.upper, torch.where(ways < 0, self.tree.lower, straight))
+        meeting = self.motion.meeting(straight, closed)
+        best, most = tried[meeting.argmax()], meeting.max()
+        # Without the best combinations in which a finger closes so, others bring fingertips less near to each other.
+        lost = most - torch.where(tried == best, -torch.inf, meeting[:, None]).amax(0)
+        decided = lost > torch.clamp(DECIDES * most / len(best), min=NEARER)
+        return curls, torch.where(decided, best, 0.0).tolist()
 
     def folded(self, closing: Closing) -> Bool[Tensor, " n_tips"]:
         """Fingers that fold back before the joints are at their open ends."""
         shares = torch.linspace(1, 0, PATH).tolist()
         path = torch.stack([self.posture(closing.open_ends, closing.opening_signs, closing.abduction, s) for s in shares])
         axis = Line(_tensor(closing.palm.centre), _tensor(closing.palm.direction))
-        return self.motion.folded(path, self.movable & ~closing.abduction, axis)
+        both = torch.tensor([curl.back >= BOTH_WAYS for curl in self.sides[0]])
+        return self.motion.folded(path, self.movable & ~closing.abduction, axis, both)
 
     @cached_property
     def motion(self) -> FingerMotion:
@@ -405,19 +452,25 @@ class ClosingFinder:
         """Joints that only spread fingers: their axes point out of the palm, at rest and with bent fingers alike."""
         bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
         direction = _tensor(palm.direction)
-        return (axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)) | self.sideways
+        along = axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)
+        spreading = self.motion.spreading(self.straight, self.sides[0], self.movable, direction, self.sweep)
+        return along | self.sideways | spreading
 
     def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
         """The palm at the closing where palm and fingers enclose a ball best."""
         jaw, on_palm, on_fingers = self.fixed_jaw(opened, signs, abduction), self.on_palm, self.on_fingers
         if jaw is not None:
             on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
-        palms = []
-        for share in self.closings:
-            points, normals = self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share))
-            palms.append(find_palm(points[on_palm], normals[on_palm], [points[mask] for mask in on_fingers]))
-        best = max(palms, key=lambda palm: palm.score)
-        return best if jaw is None else dataclasses.replace(best, direction=jaw.direction)
+        posed = [self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share)) for share in self.closings]
+        parts = [(points[on_palm], normals[on_palm], [points[mask] for mask in on_fingers]) for points, normals in posed]
+        best = max((find_palm(*part) for part in parts), key=lambda palm: palm.score)
+        if jaw is not None:
+            return dataclasses.replace(best, direction=jaw.direction)
+        if self.sweep is None or best.direction @ self.sweep > FACING:
+            return best
+        with contextlib.suppress(HandError):
+            best = max((find_palm(*part, self.sweep) for part in parts), key=lambda palm: palm.score)
+        return best if best.direction @ self.sweep > FACING else dataclasses.replace(best, direction=self.sweep)
 
     @cached_property
     def on_fingers(self) -> list[Bool[np.ndarray, " n"]]:
@@ -426,11 +479,14 @@ class ClosingFinder:
 
     def fixed_jaw(self, opened: Joints, signs: Joints, abduction: JointMask) -> FixedJaw | None:
         """The part of the palm that a single finger closes on; None for several fingers."""
-        if len(self.fingers) > 1:
+        if len(self.fingers) != 1:
             return None
-        postures = (self.posture(opened, signs, abduction, share) for share in NEARLY_CLOSED)
-        before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
-        return find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])
+        for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in self.fingers)]:
+            postures = (self.posture(opened, signs, abduction, share) for share in shares)
+            before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
+            if (jaw := find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])) is not None:
+                return jaw
+        return None
 
     def opened(self, signs: Joints) -> Joints:
         """The stated open posture; for other joints the limits towards which they open."""

@@ -16,6 +16,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
 from dro_grasp.hands.kinematics.tree import KinematicTree
+from dro_grasp.hands.names import named_thumb
 
 if TYPE_CHECKING:
     from dro_grasp.hands.description.loader import Description
@@ -98,7 +99,8 @@ class Hand:
 
     def with_thumb(self) -> Hand:
         """The same hand with its thumb found."""
-        return dataclasses.replace(self, thumb=find_thumb(self.thumb_opposition))
+        named = named_thumb([[self.tree.link_names[link] for link in finger.links] for finger in self.fingers])
+        return dataclasses.replace(self, thumb=find_thumb(self.thumb_opposition, named))
 
     @cached_tensor
     def closed_ends(self) -> Float[Tensor, " n_dof"]:

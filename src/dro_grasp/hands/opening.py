@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -41,8 +42,16 @@ FAR_BACK = 0.7  # Angle from which on a joint bends a finger far back [rad] (our
 BOTH_WAYS = 0.9
 """Least share of the way that a joint closes its finger by which it also bends it back, for that its limits are taken to say
 nothing of how far it opens (ours). LEAP's thumb, which opens to its limits, has 0.71."""
+ONE_WAY = 0.6
+"""Share of how far it bends to one side, below which how far a finger bends to the other tells that it closes to the first
+(ours). Of 16 hands, all fingers but LEAP's thumb (0.71), Shadow's (0.6) and D'Claw's have 0.4 at most."""
+TO_PALM = 0.5  # Cosine up to which such a joint does not move it to the palm (ours)
+WIDEST_SPREAD = 1.6  # Range below which a joint may spread a finger, where its axis is not along the palm's [rad] (ours)
 LEVEL = 0.7  # Cosine from which on a fingertip moves along the line along which most of them move (ours)
 IN_PLANE = 0.3  # Distance of a knuckle from the plane of the others that is none, as a share of its finger's reach (ours)
+CURLED = 0.95  # Share of its longest reach below which a finger is not straight (ours)
+LEAST_CURL = 0.3  # Angle below which limits do not tell to which side a finger curls [rad] (ours)
+WAY = 25  # Postures on the way from straight to closed fingers at which fingertips are looked for near each other (ours)
 STILL = 5e-3  # Slower fingertips do not move with a joint [m/rad or m/m] (ours)
 
 
@@ -61,6 +70,16 @@ class Line:
     def _across(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         offset = points - self.point
         return offset - (offset @ self.direction)[..., None] * self.direction
+
+
+@dataclass(frozen=True)
+class Curl:
+    """How a finger curls: its hinges with parallel axes bend it the same way."""
+
+    ways: Joints
+    """+1 for joints that, increasing, curl it to the side to which it bends farther, -1 for those that straighten it so."""
+    back: float
+    """How far it bends to the other side, as a share of how far it bends to that one."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +134,54 @@ class FingerMotion:
             found |= (self.tree.link_coupling[hinges] != 0).any(0)
         return found
 
+    def curls(self, straight: Joints, moved: JointMask) -> list[Curl]:
+        """The curl of each finger, by how far its hinges beyond the first bend it from where it is straight to either side."""
+        angular = self.tree.motion_axes(self.tree.forward(straight))[1]
+        up, down = self.tree.upper - straight, straight - self.tree.lower
+        return [self._curl(finger, angular, moved, up, down) for finger in self.fingers]
+
+    def _curl(self, finger: Finger, angular: Float[Tensor, "n_links 3"], moved: JointMask, up: Joints, down: Joints) -> Curl:
+        turn = self.tree.link_coupling * moved
+        links = [link for link in finger.chain if self.tree.kind[link] == REVOLUTE and bool(turn[link].any())]
+        if not links:
+            return Curl(torch.zeros_like(up), 1.0)
+        alike = angular[links] @ angular[links].T
+        far = turn[links].abs() @ (up + down)
+        main = int(((alike.abs() > PARALLEL) * far).sum(1).argmax())
+        hinges = [i for i in range(len(links)) if abs(float(alike[main, i])) > PARALLEL]
+        turn = turn[[links[i] for i in hinges]] * alike[main, hinges].sign()[:, None]
+        turn = turn * ((turn.amin(0) >= 0) | (turn.amax(0) <= 0))  # rods that keep a fingertip parallel curl nothing
+        forth, back = (float((turn.relu() @ a + (-turn).relu() @ b)[1:].sum()) for a, b in ((up, down), (down, up)))
+        ways = turn.sum(0).sign() * (1.0 if forth >= back else -1.0)
+        return Curl(ways, min(forth, back) / max(forth, back, 1e-9) if max(forth, back) > LEAST_CURL else 1.0)
+
+    def meeting(self, straight: Joints, closed: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, " *batch"]:
+        """By how much squared distances between fingertips shrink on the way from straight fingers to closed ones [m^2]."""
+        shares = torch.linspace(0, 1, WAY).reshape(-1, *[1] * closed.dim())
+        tips = self.tips(straight + shares * (closed - straight))
+        apart = (tips[..., :, None, :] - tips[..., None, :, :]).square().sum(-1)
+        return (apart[0] - apart.amin(0)).sum((-2, -1))
+
+    def spreading(
+        self, straight: Joints, curls: list[Curl], moved: JointMask, palm_direction: Point,
+        sweep: Float[np.ndarray, "3"] | None,
+    ) -> JointMask:
+        """Joints that move a straight finger's tip a little across the way in which it curls, and not to the palm.
+
+        Where fingers close alike along `sweep`, those of one that closes otherwise, a thumb, spread nothing.
+        """
+        velocity, found = self.velocities(straight), torch.zeros_like(moved)
+        small = moved & (self.tree.joint_unit == 1) & (self.tree.upper - self.tree.lower < WIDEST_SPREAD)
+        for row, (finger, curl) in enumerate(zip(self.fingers, curls, strict=True)):
+            others = self.tree.moves[finger.tip] & (curl.ways == 0) & bool(curl.ways.any())
+            ways = torch.nn.functional.normalize(velocity[row], dim=0)
+            closing = torch.nn.functional.normalize(velocity[row] @ curl.ways, dim=0)
+            if sweep is not None and abs(float(closing @ torch.from_numpy(sweep).float())) < LEVEL:
+                continue
+            across = ((closing @ ways).abs() < ACROSS) & ((palm_direction @ ways).abs() < TO_PALM)
+            found |= small & others & across & (velocity[row].norm(dim=0) > STILL)
+        return found
+
     def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
         """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
@@ -155,12 +222,13 @@ class FingerMotion:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         return self._best(lambda q: axis.span(self.tips(q), self.knuckles(q, bends)).sum(-1), start, bends)
 
-    def straightest(self, start: Joints, bends: JointMask) -> Joints:
+    def straightest(self, start: Joints, bends: JointMask, same: float = SAME_SPAN) -> Joints:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
-        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends)
+        return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends, same)
 
     def _best(
-        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask
+        self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask,
+        same: float = SAME_SPAN,
     ) -> Joints:
         """The posture that measures most, found joint by joint."""
         q, tree = start, self.tree
@@ -173,21 +241,31 @@ class FingerMotion:
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
                 total = measure(tried)
-                q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
+                q = tried[int((total > total.max() - same).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
 
     def knuckle_joints(self, bends: JointMask) -> JointMask:
-        """The joints that move the knuckles' links: beyond them, fingers are straight or bent."""
-        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends
+        """The joints that move the knuckles' links, and none beyond them, where fingers are straight or bent."""
+        return self.tree.moves[[self._knuckle(finger, bends) for finger in self.fingers]].any(0) & bends & ~self.whole(bends)
 
-    def folded(self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line) -> Bool[Tensor, " n_tips"]:
-        """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
-        at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
+    def whole(self, bends: JointMask) -> JointMask:
+        """Joints that bend a finger at its knuckle and, by couplings, beyond it: where it reaches farthest, it is not open."""
+        firsts = [self._knuckle(finger, bends) for finger in self.fingers]
+        beyond = [link for finger, first in zip(self.fingers, firsts, strict=True) for link in finger.chain if link > first]
+        return (self.tree.link_coupling[firsts] != 0).any(0) & (self.tree.link_coupling[beyond] != 0).any(0)
+
+    def folded(
+        self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line, both_ways: Bool[Tensor, " n_tips"]
+    ) -> Bool[Tensor, " n_tips"]:
+        """Fingers that, on a path to open, point behind the palm, or lose most of their reach if they bend both ways."""
+        # They do so beyond their widest span, or beyond where they are straight.
+        span, reach = axis.span(self.tips(path), self.knuckles(path, bends)), self.reaches(path, bends).norm(dim=-1)
+        at = torch.where(reach.amin(0) < CURLED * reach.amax(0), reach.argmax(0), span.argmax(0))
         beyond = torch.arange(len(path))[:, None] >= at
-        behind = self.behind(path, bends, axis.direction) > BEHIND
-        return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | behind)).any(0)
+        short = (self.kept(path, bends, at) < LEAST_REACH) & both_ways
+        return (beyond & (short | (self.behind(path, bends, axis.direction) > BEHIND))).any(0)
 
     def behind(
         self, q: Float[Tensor, "*batch n_dof"], bends: JointMask, palm_direction: Point
@@ -231,10 +309,10 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes if (guess := _guessed_side(hand)) is None else [*notes, guess]
+    return notes
 
 
-def _guessed_side(hand: Hand) -> Note | None:
+def guessed_side(hand: Hand) -> Note | None:
     """A flat hand whose limits do not tell its palm's side: its fingers, but for a thumb, bend as far back as forth."""
     stated = hand.tree if hand.description is None else hand.description.tree
     beyond = torch.where(hand.opening_signs > 0, stated.upper - hand.open_ends, hand.open_ends - stated.lower)
@@ -244,7 +322,8 @@ def _guessed_side(hand: Hand) -> Note | None:
     if min(int(both[lasts].sum()), int(level.sum())) < max(1, len(lasts) - (hand.thumb is not None)):
         return None
     return Note("warning", hand.tree.link_names[hand.palm], "has fingers that bend as far back as forth, so its inner side is "
-                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side")
+                "a guess; look at the picture, and where the arrow is wrong, state limits that bend fingers to the other side, "
+                "or a closed posture")
 
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:

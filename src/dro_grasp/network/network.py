@@ -278,7 +278,7 @@ def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
     if other := model.config.differences(initial.config):
         told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
         raise WeightsError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; train "
-                           "with theirs, which `train --initial` does without --preset")
+                           "with theirs, which `train --initial` does with the preset left out")
     model.load_state_dict(initial.state_dict())
 
 
@@ -300,6 +300,6 @@ def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None
     take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
     if pretrained.motion is not None and model.motion is None:
         raise WeightsError(f"weights '{pretrained.name}' hold a pretrained motion, but z does not move the hand in this "
-                           "network; train in frame 'palm' (--preset multi)")
+                           "network; train in frame 'palm' (preset='multi')")
     if pretrained.motion is not None and model.motion is not None:
         take_weights(model.motion, pretrained.motion, pretrained.name)

@@ -20,25 +20,38 @@ Arrays = dict[str, Num[np.ndarray, "..."]]  # Arrays by name, as in an NPZ file
 def cache_folder() -> Path:
     """The folder of derived geometry: `DRO_GRASP_CACHE`, or the user's cache folder."""
     root = os.environ.get("DRO_GRASP_CACHE")
-    return given_path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
+    if root:
+        return given_path(root)
+    stated = Path(os.environ.get("XDG_CACHE_HOME", ""))  # by its specification an empty or relative one does not count
+    return (stated if stated.is_absolute() else Path.home() / ".cache") / "dro-grasp"
 
 
 def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
-    """Load arrays from the cache, or make and store them.
+    """Load arrays from the cache, or make and store them."""
+    stored = stored_arrays(key)
+    if stored is not None:
+        return stored
+    made = make()
+    store_arrays(key, made)
+    return made
 
-    A damaged file is replaced. A folder that cannot be written is no error; it only costs time.
-    """
-    path = cache_folder() / f"{key}.npz"
+
+def stored_arrays(key: str) -> Arrays | None:
+    """Arrays from the cache; None where there are none, or where their file is damaged."""
     try:
-        with path.open("rb") as file, np.load(file) as stored:
+        with (cache_folder() / f"{key}.npz").open("rb") as file, np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
     except FOREIGN:  # missing, truncated, or no archive of arrays
-        made = make()
+        return None
+
+
+def store_arrays(key: str, arrays: Arrays) -> None:
+    """Put arrays into the cache. A folder that cannot be written is no error; it only costs time."""
+    path = cache_folder() / f"{key}.npz"
     with contextlib.suppress(OSError, OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **made)  # type: ignore[arg-type]
-    return made
+            np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def content_hash(*arrays: Num[np.ndarray, "..."]) -> str:

@@ -17,13 +17,22 @@ from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
-from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, read_geometry
+from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 LARGEST = 1.0  # Largest extent of an object that counts as metres [m] (ours)
 SMALLEST = 0.005  # Smallest such extent [m] (ours)
+FITTING = 0.5  # Largest extent that a hint suggests [m] (ours)
+UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "metres": 1.0}
+"""Units that files use [m]."""
+UNIT_OF = {".stl": "millimetres", ".3mf": "millimetres", ".off": "millimetres", ".glb": "metres", ".gltf": "metres",
+           ".dae": "metres", ".obj": "centimetres"}
+"""Units of formats, or what most programs write in them (ours); of others, metres."""
+FARTHEST_VIEW = 20.0  # Largest extent of a view of a depth camera [m] (ours)
 FARTHEST = 100.0  # Largest coordinate [m] (ours): single precision rounds it by 4 micrometres
 MIN_CLOUD = 16  # Fewest distinct points of a bare cloud (ours)
+ONE_SIDED = 0.3  # Mean of the normals above which a cloud is one side of an object [1] (ours)
 NEIGHBOURS = 16  # Neighbours that estimate the normals of a bare cloud (ours)
 
 
@@ -38,7 +47,10 @@ def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> Ob
                           "`dro-grasp objects` lists")
     geometry, unit = read_geometry(path)
     if isinstance(geometry, np.ndarray):
-        return cloud_object(path.stem, geometry * unit, origin=str(path), scale=scale, keep_table=keep_table)
+        if unit != 1.0:
+            geometry[:, :3] *= unit
+        return cloud_object(path.stem, geometry, origin=str(path), scale=scale, keep_table=keep_table,
+                            named_normals=path.suffix.lower() != ".npy")
     if unit != 1.0:
         geometry.apply_scale(unit)
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
@@ -88,18 +100,18 @@ def mesh_object(
 
 def cloud_object(
     name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False,
-    seen: Float[np.ndarray, "m 3"] | None = None,
+    seen: Float[np.ndarray, "m 3"] | None = None, named_normals: bool = False,
 ) -> ObjectModel:
-    """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
+    """An object from a bare point cloud (n 3), or a cloud with normals (n 6), organised or not; only the points are scaled.
 
     `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
+    `named_normals` judges the normals that a file calls so: they are turned or estimated where they are no outward ones.
     """
+    points = in_rows(points)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "
                           "with normals")
-    bad = int((~np.isfinite(points)).any(1).sum())
-    if bad:
-        raise ObjectError(f"{origin} has {bad} points with NaN or infinite coordinates; remove them first")
+    points, dropped = _where_seen(points)
     xyz = points[:, :3] * scale
     one = distinct_points(xyz)
     merged = () if len(one) == len(points) else (f"merged {len(points) - len(one)} duplicated points",)
@@ -108,45 +120,90 @@ def cloud_object(
     if table is not None:
         kept = above_plane(xyz, table)
         xyz, points = xyz[kept], points[kept]
+    cut = () if table is None else (table_note(table, total - len(points), total),)
+    if not keep_table:
+        own, apart = one_thing(xyz, table is not None, origin)
+        xyz, points, cut = xyz[own], points[own], (*cut, *apart)
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
-        check_extent(xyz, origin, scale)
+        check_view(xyz, origin, scale)
     if len(xyz) < MIN_CLOUD:
         raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
     cloud = np.ascontiguousarray(xyz[keep], np.float32)
-    given = points[keep, 3:]
-    length = np.linalg.norm(given, axis=1, keepdims=True)
-    has_normals = points.shape[1] == 6 and length.min() > 1e-6
-    if has_normals and not length.max() < 1.2 * length.min():  # (ours) something else, such as colours
-        raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
-                          "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
-    normals = given / length if has_normals else estimate_normals(cloud)
-    cut = () if table is None else (table_note(table, total - len(points), total),)
+    normals, odd = given_normals(cloud, points[keep, 3:], origin, named_normals)
+    has_normals = normals is not None
+    normals = normals if normals is not None else estimate_normals(cloud)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
     estimated = "" if has_normals else "; normals were estimated"
     return ObjectModel(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
         table=table, seen=None if seen is None else seen.astype(np.float32),
-        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *merged,
-               *cut, *(() if has_normals else _one_sided(normals))))
+        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *dropped,
+               *merged, *cut, *odd, *(() if has_normals else _one_sided(normals))))
+
+
+def _where_seen(points: Num[np.ndarray, "n k"]) -> tuple[Num[np.ndarray, "m k"], tuple[str, ...]]:
+    """The points where something was seen, and how many are none."""
+    kept = returned(points[:, :3])
+    return (points, ()) if kept.all() else (points[kept], (dropped_note(int((~kept).sum()), len(kept)),))
+
+
+def dropped_note(count: int, total: int) -> str:
+    """What to say of points where nothing was seen."""
+    return f"{count} of {total} points are none (NaN, or 0 0 0 for no return) and were dropped"
+
+
+def given_normals(
+    cloud: Float[np.ndarray, "n 3"], given: Num[np.ndarray, "n k"], origin: str, named: bool
+) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
+    """Unit normals as they were given, turned if they are inward all over; None to estimate them. And what to say."""
+    if given.shape[1] != 3:
+        return None, ()
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    unit = bool(np.isfinite(length).all()) and length.min() > 1e-6 and length.max() < 1.2 * length.min()  # (ours)
+    if not unit and not named and length.min() > 1e-6:  # something else, such as colours
+        raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
+                          "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
+    if not unit and not named:
+        return None, ()
+    if not unit:
+        return None, ("its normals have not all one length, so they were not used",)
+    normals = given / length
+    if not named:
+        return normals, ()
+    if _contradict(cloud, normals):
+        return None, ("its normals point to both sides of one surface, so they were not used",)
+    # The volume that a closed cloud encloses is negative where its normals point inward. One side alone encloses none.
+    inward = float(((cloud - cloud.mean(0)) * normals).sum()) < 0 and np.linalg.norm(normals.mean(0)) <= ONE_SIDED
+    return (-normals, ("its normals pointed inward and were turned",)) if inward else (normals, ())
+
+
+def _contradict(cloud: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether many neighbours on one surface have opposite normals, as those have that no one turned outward."""
+    some = np.arange(0, len(cloud), max(1, len(cloud) // 1000))
+    distance, near = KDTree(cloud).query(cloud[some], k=min(NEIGHBOURS, len(cloud)))
+    opposite = np.einsum("nki,ni->nk", normals[near], normals[some]) < -0.5
+    # Both sides of a thin sheet have opposite normals, too, but lie above one another.
+    height = np.abs(np.einsum("nki,ni->nk", cloud[near] - cloud[some][:, None], normals[some]))
+    return float((opposite & (height < 0.2 * distance))[:, 1:].mean()) > 0.1  # (ours)
 
 
 def _one_sided(normals: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
     """A question if all points face one way, as if one camera had seen them."""
     # Over closed surfaces normals add up to nothing, over half a ball their mean is 0.5; a bowl seen from everywhere asks, too.
-    if np.linalg.norm(normals.mean(0)) <= 0.3:  # (ours)
+    if np.linalg.norm(normals.mean(0)) <= ONE_SIDED:
         return ()
     return ("its points face mostly one way, and all of them count as the whole object; if they are what one camera saw, give "
-            "its pose with --camera, scanned_object in Python: the side that it did not see is then added",)
+            "its pose with camera=..., scanned_object in Python: the side that it did not see is then added",)
 
 
 def table_note(table: Float[np.ndarray, "4"], removed: int, total: int) -> str:
     """What to say of a table that was cut off."""
     x, y, z, height = (round(float(value), 3) + 0.0 for value in table)
     return (f"a table was found in the cloud (all points where {x:g} x + {y:g} y + {z:g} z = {height:g} m) and {removed} of "
-            f"{total} points were cut off with it; hands stay above it. Keep them with --keep-table, keep_table=True in Python")
+            f"{total} points were cut off with it; hands stay above it. Keep them with keep_table=True")
 
 
 def estimate_normals(
@@ -177,11 +234,11 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
 def check_scale(scale: float) -> None:
     """Refuse a factor that is no positive number, by an ObjectError."""
     if not (math.isfinite(scale) and scale > 0):
-        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+        raise ObjectError(f"scale is {scale}; give a positive number, for example scale=0.001 for millimetres")
 
 
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
-    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale."""
+    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale in place of `scale`."""
     # Most files state no unit, and a wrong guess would grasp air.
     largest, farthest = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if SMALLEST <= largest <= LARGEST and farthest > FARTHEST:
@@ -191,11 +248,31 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
         return
     if largest <= 0:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
-    size, change = (f"{largest:.4g} m, too large", "--scale: 0.001 for millimetres;") if largest > LARGEST else (
-        f"{largest * 1000:.3g} mm, too small", "a larger --scale:")
-    power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give {change} "
-                      f"{scale * power:.3g} makes it {largest * power * 100:.2g} cm")
+    size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
+    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give "
+                      f"{_scale_hint(largest / scale, origin)}")
+
+
+def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
+    """Refuse clouds of implausible sizes, as `check_extent` does; those as large as a view may be one."""
+    largest = float(np.ptp(points, axis=0).max())
+    if LARGEST < largest <= FARTHEST_VIEW:
+        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in "
+                          "metres, cut out the object that is meant; if its unit is not the metre, give "
+                          f"{_scale_hint(largest / scale, origin)}")
+    check_extent(points, origin, scale)
+
+
+def _scale_hint(largest: float, origin: str) -> str:
+    """Scales that make a thing that measures so much in its file [the file's unit] fit a hand, the likeliest first."""
+    own = UNIT_OF.get(Path(origin).suffix.lower(), "metres")
+    fits = [(unit, scale) for unit, scale in UNITS.items() if SMALLEST <= largest * scale <= FITTING]
+    if not fits:
+        power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
+        return f"a scale: scale={power:.3g} makes it {largest * power * 100:.3g} cm"
+    # After the format's own unit, that comes first which makes it as large as most things that are grasped.
+    fits.sort(key=lambda fit: (fit[0] != own, abs(math.log(largest * fit[1] / 0.1))))
+    return "; ".join(f"scale={scale:g} for {unit}, which makes it {largest * scale * 100:.3g} cm" for unit, scale in fits)
 
 
 LEAST_FILL = 1e-3
@@ -249,8 +326,12 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
 
 
 def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+    before = len(mesh.faces)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
+    if mesh.is_watertight:
+        notes.append(f"{before - len(mesh.faces)} repeated faces or faces without area were left out")
+        return
     trimesh.repair.fill_holes(mesh)
     notes.append("holes were closed" if mesh.is_watertight else
                  "not watertight: distances use winding numbers, which cope with small holes")

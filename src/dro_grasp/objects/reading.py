@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Num, Shaped
+from jaxtyping import Bool, Float, Num, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
@@ -18,25 +20,54 @@ ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scen
                 | Num[Tensor, "..."])
 """What an object can be loaded from: its name or file, a mesh, a pair (vertices, faces), or points."""
 ORIGIN = "the given object"  # What messages call it
+MOST_GROWTH = 128  # What LZF can shorten data to [1]. Source: its longest copy, 264 bytes, takes 3
+ALONE = 0.1  # Distance of a point from all others, over the extent of these, that puts it elsewhere [1] (ours)
+FEW = 16  # Points of which none is called alone (ours)
 CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
+    return read_rows(path)[:, :3]
+
+
+def read_rows(path: Path) -> Float[np.ndarray, "n columns"]:
+    """The same, with the normals that the file has of them in three more columns."""
     if not path.is_file():
-        raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
+        raise ObjectError(f"no file at {path}; with camera=... give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
-        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
-    return coordinates(geometry, str(path)) * unit
+        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out camera=..., or give a cloud (PLY, NPY, PCD)")
+    rows = in_rows(geometry)
+    points = coordinates(rows, str(path)) * unit
+    return np.column_stack([points, rows[:, 3:]]) if rows.shape[1] == 6 else points
 
 
 def coordinates(cloud: Shaped[np.ndarray, "..."], origin: str) -> Float[np.ndarray, "n 3"]:
     """The points of a cloud, NaN included, without normals or colours; an ObjectError if they are none."""
+    cloud = in_rows(cloud)
     if cloud.ndim != 2 or cloud.shape[1] < 3:
         raise ObjectError(f"{origin} holds an array of shape {cloud.shape}; expected (n, 3) points")
     return np.asarray(cloud[:, :3], np.float64)
+
+
+def in_rows(cloud: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+    """An organised cloud, one point a pixel (h, w, 3 or 6), as rows of points; other arrays as they are."""
+    return cloud.reshape(-1, cloud.shape[2]) if cloud.ndim == 3 and cloud.shape[2] in (3, 6) else cloud
+
+
+def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points of a cloud are where something was seen: NaN, infinity and (0, 0, 0) stand for pixels without a depth.
+
+    One point at the origin may be the object's; it is none if it is alone there, far from all others.
+    """
+    finite = np.asarray(np.isfinite(points).all(1))
+    zero = np.asarray((points == 0).all(1))
+    others = points[finite & ~zero]
+    if zero.sum() == 1 and (len(others) < FEW or np.abs(others).max(1).min() <= ALONE * np.ptp(others, axis=0).max()):
+        return finite
+    return finite & ~zero
 
 
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
@@ -48,8 +79,8 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
         loaded = open_mesh(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    if isinstance(geometry, trimesh.PointCloud):
-        return _with_normals(geometry), unit
+        if isinstance(geometry, trimesh.PointCloud):
+            return _with_normals(geometry), unit
     if not isinstance(geometry, trimesh.Trimesh):
         raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
                           "point cloud as PLY, NPY or PCD")
@@ -136,28 +167,54 @@ def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
     """Points, and normals if there are any. A field may take several columns (COUNT)."""
     raw = path.read_bytes()
     header, start = _pcd_header(raw, path)
-    fields, count, kind = header["FIELDS"], int(header["POINTS"][0]), header["DATA"][0]
+    fields, kind = header["FIELDS"], header["DATA"][0]
+    count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     names = [*"xyz"]
     if {"normal_x", "normal_y", "normal_z"} <= set(fields):
         names += ["normal_x", "normal_y", "normal_z"]
     widths = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
     if kind == "ascii":
         columns = [sum(widths[: fields.index(name)]) for name in names]
-        lines = [line.split() for line in raw[start:].splitlines() if line.strip()][:count]
-        table = np.array(lines, dtype=np.float64).reshape(len(lines), -1)[:, columns]
-    elif kind == "binary":
+        table = _ascii_rows(raw[start:], columns, count)
+    elif kind in {"binary", "binary_compressed"}:
         letters, sizes = {"F": "f", "I": "i", "U": "u"}, zip(header["TYPE"], header["SIZE"], widths, strict=True)
         try:
-            layout = np.dtype([(f"{i}", f"<{letters[t]}{s}", (c,)) for i, (t, s, c) in enumerate(sizes)])
+            layout = [np.dtype((f"<{letters[t]}{s}", (c,))) for t, s, c in sizes]
         except TypeError as error:  # there is no number of such a size
             raise ValueError(str(error)) from error
-        rows = np.frombuffer(raw, layout, count=count, offset=start)
+        rows = _packed_columns(raw[start:], layout, count) if kind == "binary_compressed" else np.frombuffer(
+            raw, np.dtype([(f"{i}", each) for i, each in enumerate(layout)]), count=count, offset=start)
         table = np.stack([rows[f"{fields.index(name)}"][:, 0].astype(np.float64) for name in names], 1)
     else:
-        raise ObjectError(f"{path} holds {kind} data; save the cloud as ascii or binary PCD")
+        raise ObjectError(f"{path} holds {kind} data; save the cloud as ascii, binary or binary_compressed PCD")
     if len(table) != count:
         raise ObjectError(f"{path} is truncated: its header promises {count} points, it holds {len(table)}")
     return table
+
+
+def _ascii_rows(text: bytes, columns: list[int], count: int) -> Float[np.ndarray, "n columns"]:
+    """Some columns of a table of numbers in text, at most so many rows of it."""
+    if not count or not text.strip():
+        return np.zeros((0, len(columns)))
+    return np.loadtxt(io.BytesIO(text), usecols=columns, ndmin=2, max_rows=count, comments=None)
+
+
+def _packed_columns(raw: bytes, layout: list[np.dtype], count: int) -> dict[str, Num[np.ndarray, "n width"]]:
+    """Columns by their place, from compressed data of a PCD file: sizes after and before, then field after field."""
+    import lzf  # type: ignore  # compiled, without types
+
+    packed, size = struct.unpack_from("<II", raw)
+    if size != count * sum(each.itemsize for each in layout):
+        raise ValueError(f"{count} points take {count * sum(each.itemsize for each in layout)} bytes, it states {size}")
+    if size > MOST_GROWTH * packed or len(raw) < 8 + packed:
+        raise ValueError(f"{packed} compressed bytes are promised, {len(raw) - 8} are there, {size} should come of them")
+    # What LZF cannot shorten is stored as it is.
+    data = raw[8 : 8 + packed] if packed == size else lzf.decompress(raw[8 : 8 + packed], size)
+    if data is None or len(data) != size:
+        raise ValueError("its compressed data are damaged")
+    ends = np.cumsum([count * each.itemsize for each in layout])
+    return {f"{i}": np.frombuffer(data, each, count=count, offset=int(end) - count * each.itemsize)
+            for i, (each, end) in enumerate(zip(layout, ends, strict=True))}
 
 
 def _pcd_header(raw: bytes, path: Path) -> tuple[dict[str, list[str]], int]:

@@ -19,7 +19,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
-from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
+from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry, returned
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
@@ -90,7 +90,7 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
     """What a hand is to avoid, from the path of a mesh or cloud, a trimesh mesh or cloud, (vertices, faces), or points (n 3).
 
     Args:
-        source: The mesh or cloud, in the frame of the object that is to be grasped. Points with NaN are left out.
+        source: The mesh or cloud, in the frame of the object that is to be grasped. Points with NaN and (0, 0, 0) are left out.
         name: What to call it; the file's stem by default.
         scale: Multiplies all coordinates; 0.001 for millimetres.
 
@@ -113,7 +113,7 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
                               "or give a cloud")
     else:
         points, faces = coordinates(geometry, origin), None
-        points = points[np.isfinite(points).all(1)]
+        points = points[returned(points)]
     points = points * (scale * unit)
     if not len(points):
         raise ObjectError(f"{origin} holds no point; leave the scene out if nothing is to be avoided")

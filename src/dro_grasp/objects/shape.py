@@ -14,7 +14,7 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.geometry.point_clouds import one_per_cell, random_half
 from dro_grasp.objects.cache import cached_arrays, content_hash
-from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
+from dro_grasp.objects.convex_parts import Part, Progress, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
 DENSITY = 500.0  # Density of every object that states none [kg/m^3]. Source: the official release
@@ -54,7 +54,7 @@ class ObjectModel:
     table: Float[np.ndarray, "4"] | None = None
     """Plane that a bare cloud was cut from: upward unit normal, and height along it [m]."""
     notes: tuple[str, ...] = ()
-    """Findings and repairs of the loader."""
+    """Findings and repairs of the loader, and of the cutting into convex parts once that is done."""
     split: str | None = None
     """`train`, `validate`, `test`, or None for a user's object."""
     exact_parts: tuple[Part, ...] | None = None
@@ -94,12 +94,22 @@ class ObjectModel:
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """Convex parts that fill the object, which is no bare cloud."""
+        """Convex parts that fill the object, which is no bare cloud; `notes` then say what is odd about them."""
+        return self.cut()
+
+    def cut(self, progress: Progress | None = None) -> tuple[Part, ...]:
+        """The convex parts; the first call cuts a mesh that states none, and tells `progress` of it."""
         if self.exact_parts is not None:
             return self.exact_parts
+        if (known := vars(self).get("parts")) is not None:
+            return known
         if self.vertices is None or self.faces is None:
             raise ObjectError(f"object '{self.name}' is a bare point cloud and has no convex parts; give a mesh instead")
-        return decompose(self.vertices, self.faces, self.sha256)
+        made = decompose(self.vertices, self.faces, self.sha256, progress)
+        vars(self)["parts"] = made.parts
+        if made.note is not None and made.note not in self.notes:
+            vars(self)["notes"] = (*self.notes, made.note)
+        return made.parts
 
     @cached_property
     def coarse(self) -> ObjectModel:

@@ -15,6 +15,7 @@ from dro_grasp.objects.cache import Arrays
 GRID_SPACING = 0.003  # Spacing of a grid of signed distances [m] (ours)
 GRID_PADDING = 0.04  # Distance that the grid extends beyond the object [m] (ours)
 LARGEST_GRID = 8_000_000  # Most grid points; a larger object gets a wider spacing (ours)
+EXACT_GRID = 2_000_000  # Most points of a grid each of which is computed (ours); of larger ones, those near the surface are
 NEAR = 0.008
 """Distance from a surface up to which a grid that is filled coarsely far away is as exact as one that is not [m] (ours)."""
 STRIDE = 3  # Grid points of such a grid, per axis, for each that is computed far away (ours)
@@ -28,6 +29,7 @@ def bake_grid(surface: Float[np.ndarray, "n 3"], distance: Distances, banded: bo
     low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
+    banded = banded or bool(np.prod(counts) > EXACT_GRID)
     values = banded_values(distance, low, counts, spacing) if banded else distance(_places(low, counts, spacing))
     return {"values": values.reshape(counts).astype(np.float32), "origin": low, "spacing": np.array(spacing)}
 

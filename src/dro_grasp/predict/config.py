@@ -45,12 +45,12 @@ class GraspRequest(Checked):
         """
         super().__post_init__()
         if self.num < 1:
-            raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
+            raise OptionError(f"num is {self.num}; ask for at least one grasp (num=16)")
         if self.candidates < 1:
             raise OptionError(f"candidates is {self.candidates}; propose at least one for each grasp")
         if self.num * self.candidates > LARGEST_CALL:
             raise OptionError(f"{self.num} grasps of {self.candidates} candidates each do not fit memory; predict at most "
-                              f"{LARGEST_CALL} at once, with another --seed for more")
+                              f"{LARGEST_CALL} at once, with another seed for more (seed=1)")
         if not 0 <= self.seed < 2**63:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         check_temperature(self.temperature)

@@ -84,21 +84,21 @@ class Constraints(Checked):
         super().__post_init__()  # after these, whose errors say more
         if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
             raise OptionError(f"direction {self.direction} has no direction; give the palm direction in the object's frame, "
-                              "for example --direction 0 0 -1 to grasp from above")
+                              "for example direction=(0, 0, -1) to grasp from above")
         if self.table is not None and not math.isfinite(self.table):
-            raise OptionError(f"table is {self.table}; give the height in metres, for example --table 0")
+            raise OptionError(f"table is {self.table}; give the height in metres, for example table=0")
         if self.max_tilt is not None and not 0 < self.max_tilt <= math.pi:
             degrees = f"; {self.max_tilt:g} degrees are {math.radians(self.max_tilt):.3g}" if 0 < self.max_tilt <= 180 else ""
             raise OptionError(f"max_tilt is {self.max_tilt}; give the largest angle in radians, above 0 and at most "
                               f"3.14{degrees}")
         if self.max_tilt is not None and self.direction is None:
-            raise OptionError("max_tilt is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
-                              "--max-tilt 0.5")
+            raise OptionError("max_tilt is an angle from direction, which is absent; give both, for example "
+                              "direction=(0, 0, -1), max_tilt=0.5")
         if self.margin is not None and not 0 <= self.margin <= MAX_MARGIN:
             raise OptionError(f"margin is {self.margin}; give a multiple of the object's weight from 0 to {MAX_MARGIN:g}, for "
-                              "example --margin 1.5")
+                              "example margin=1.5")
         if self.max_force is not None and not 0 < self.max_force < math.inf:
-            raise OptionError(f"max_force is {self.max_force}; give newtons above 0, for example --max-force 5; leave it out "
+            raise OptionError(f"max_force is {self.max_force}; give newtons above 0, for example max_force=5; leave it out "
                               "where contacts may press as hard as they do")
         if self.pregrasp_clearance is not None and not 0 < self.pregrasp_clearance <= MAX_PREGRASP_CLEARANCE:
             raise OptionError(f"pregrasp_clearance is {self.pregrasp_clearance}; give metres, above 0 and at most "
@@ -192,7 +192,7 @@ def _vector(given: Any) -> Direction:
         x, y, z = _numbers(given)
     except (TypeError, ValueError, RuntimeError, OptionError) as error:  # PyTorch raises the third
         raise OptionError(f"direction is {_shortly(given)}; give three numbers, the palm direction in the object's frame, for "
-                          "example --direction 0 0 -1 to grasp from above") from error
+                          "example direction=(0, 0, -1) to grasp from above") from error
     return x, y, z
 
 

@@ -76,7 +76,7 @@ class Tally:
             steps.append("try another seed")
         steps += advice(problem, self.dropped) + (["use the source 'auto'"] if alone else [])
         if doubted:
-            steps.append("see the doubtful ones with least_confidence 0 (--least-confidence 0)")
+            steps.append("see the doubtful ones with least_confidence=0")
         told = (f"only {self.found} of {self.made} candidates on object '{problem.obj.name}' meet what was asked of them"
                 f"{dropped_in_words(self.dropped)}; {asked} were asked for. ")
         if doubted:
@@ -119,14 +119,14 @@ def find_misfits(problem: GraspProblem) -> Iterator[Misfit]:
     across = widths if problem.constraints.direction is None else widths[_across(lines, problem.constraints.direction)]
     if narrow > opening:
         yield Misfit(f"The object is {_cm(narrow)} wide where it is narrowest, and '{hand.name}' opens {_cm(opening)} at its "
-                     "fingertips", "take a larger hand, or check the object's unit (--scale)")
+                     "fingertips", "take a larger hand, or check the object's unit (scale=...)")
     elif float(across.min()) > opening:
         yield Misfit(f"Seen from this direction the object is {_cm(float(across.min()))} wide, too much to pinch it from two "
                      f"sides: '{hand.name}' opens {_cm(opening)} at its fingertips",
-                     "grasp from another direction (--direction)")
+                     "grasp from another direction (direction=...)")
     if middle < gap:
         yield Misfit(f"The object is {_cm(middle)} thick, and the fingertips of '{hand.name}' come no nearer to each other "
-                     f"than {_cm(gap)}", "take a smaller hand, or check the object's unit (--scale)")
+                     f"than {_cm(gap)}", "take a smaller hand, or check the object's unit (scale=...)")
     weight, held = problem.mass * GRAVITY, CARRY.friction * fingertip_forces(hand)
     if weight > held:
         yield Misfit(f"The object weighs {weight:.3g} N ({problem.mass:.3g} kg), and the fingertips of '{hand.name}' hold no "

@@ -109,7 +109,7 @@ def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None
 @checked
 def evaluate(
     problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL,
-    progress: Callable[[int, int], None] | None = None, workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None, workers: int | None = None, another: bool = False,
 ) -> GraspBatch:
     """Grasps with the outcome of a trial each.
 
@@ -119,10 +119,13 @@ def evaluate(
         protocol: Name of a protocol, or one of your own.
         progress: Called with (trials done, trials in all).
         workers: Threads; all cores by default.
+        another: Take the problem's object although the grasps were made for one of other name and content.
 
     Raises:
-        ObjectError: The object is a bare cloud.
+        ObjectError: The object is a bare cloud, or not that of the grasps.
         GraspFileError: The grasps are of another hand.
         OptionError: No protocol has the name.
     """
-    return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))
+    result = simulate(
+        problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress, another=another)
+    return grasps.with_trial(result)

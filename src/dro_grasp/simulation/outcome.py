@@ -198,14 +198,14 @@ class Measurements:
 
 
 FEW = 0.5  # Share of successes below which a user is told what to do next (ours)
-MORE = "propose more candidates for each grasp (--candidates 16), or take them from the optimiser (--source optimiser)"
+MORE = "propose more candidates for each grasp (candidates=16), or take them from the optimiser (source='optimiser')"
 """What helps against most failures: choosing from more grasps."""
 REMEDIES = {
     Failure.PENETRATION: MORE,
     Failure.SELF_PENETRATION: f"see what the hand's shapes do in `dro-grasp hand check HAND --picture hand.png`; {MORE}",
     Failure.UNSTABLE: "see what `dro-grasp hand check HAND` warns of: masses, inertias and limits of the description",
-    Failure.PUSHED_AWAY: f"{MORE}; ask for another palm direction (--direction X Y Z), from which the fingers close around it",
-    Failure.NO_CONTACT: "check that the object's size suits the hand (--scale), and look at the grasps (`dro-grasp view`)",
+    Failure.PUSHED_AWAY: f"{MORE}; ask for another palm direction (direction=(X, Y, Z)), so that the fingers close around it",
+    Failure.NO_CONTACT: "check that the object's size suits the hand (scale=...), and look at the grasps (`dro-grasp view`)",
     Failure.LOST: MORE,
     Failure.TURNED: MORE,
     Failure.SLIPPED: MORE,

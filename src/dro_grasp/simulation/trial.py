@@ -30,7 +30,7 @@ from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
 @checked
 def simulate(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    workers: int | None = None, progress: Callable[[int, int], None] | None = None,
+    workers: int | None = None, progress: Callable[[int, int], None] | None = None, another: bool = False,
 ) -> TrialResult:
     """Evaluate grasps of one object in MuJoCo.
 
@@ -41,14 +41,17 @@ def simulate(
         protocol: A name in PROTOCOLS, or a Protocol of your own.
         workers: Threads; all cores by default. The result does not depend on it.
         progress: Called with (grasps evaluated, grasps in all).
+        another: Take the object although the grasps were made for one of other name and content.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
+        ObjectError: The object is a bare point cloud, or not that of the grasps.
         HandError: The hand came without its description.
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.
     """
     scene = scene_of(hand, obj, grasps, protocol)
+    if not another:
+        grasps.require_object(obj)
     results, done = [], 0
     for part, rollout in rollouts(scene, hand, grasps, workers):
         penetration = measure_penetration(scene, part)
@@ -74,7 +77,7 @@ def record(
     scene = scene_of(hand, obj, grasps, protocol)
     (grasp, rollout), = rollouts(scene, hand, grasps[index], workers=1, stride=stride)
     penetration = measure_penetration(scene, grasp)
-    if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1).shown):
+    if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1, another=True).shown):
         conditions = draw(scene.protocol.perturbations, grasp).rows(slice(shown - 1, shown))
         rollout = Rollout(_scene_of_trial(scene, shown), grasp, workers=1, stride=stride, conditions=conditions)
     run_trial(rollout, penetration)

@@ -56,7 +56,7 @@ JUDGE = PROTOCOLS[DEFAULT_PROTOCOL].label  # Protocol by which fine-tuning is ju
 class OnboardingConfig(Checked):
     """How long onboarding takes, and on which objects."""
 
-    minutes: float = 30.0  # time for data, training and trials together [min]
+    minutes: float = 30.0  # time for data, training and trials together [min]; trials are not cut off when it is over
     objects: tuple[str, ...] = ("builtin:train",)  # objects to synthesize grasps of
     held_out: tuple[str, ...] = ("builtin:test",)  # objects of the benchmarks before and after; never trained on
     num: int = 20
@@ -84,9 +84,9 @@ class OnboardingConfig(Checked):
         """Refuse numbers out of range, and a source that does not exist."""
         super().__post_init__()
         if not (math.isfinite(self.minutes) and self.minutes > 0):
-            raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
+            raise OptionError(f"minutes is {self.minutes}; give a positive number, for example minutes=30")
         require_device(self.device)
-        for name, option in (("num", " (--num)"), ("workers", " (--workers)"), ("most_grasps", ""), ("grasps_drawn", "")):
+        for name, option in (("num", " (num=...)"), ("workers", " (workers=...)"), ("most_grasps", ""), ("grasps_drawn", "")):
             if (value := getattr(self, name)) < 1:
                 raise OptionError(f"{name} is {value}; give at least 1{option}")
         if min(shares := (self.data_share, self.training_share)) <= 0 or sum(shares) > 1:
@@ -128,14 +128,14 @@ class Onboarded:
         lines = []
         if not self.gained:
             low, high = difference_interval(held, asked, held_after, asked_after)
-            better = "No more than all can hold" if held == asked else "To gain, try more --minutes or more --objects"
+            better = "No more than all can hold" if held == asked else "To gain, try more minutes or more objects"
             if held_after > held:
-                better += "; to tell a small gain from chance, more --num"
+                better += "; to tell a small gain from chance, evaluate more grasps (num=...)"
             lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under "
                          f"{JUDGE} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
                          f"95 %). Keep the weights from before. {better}.")
         if self.without_grasps:
-            lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
+            lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try objects of a size that suits the "
                          "hand, and look at its picture for a wrong palm side or opening.")
         return lines
 
@@ -165,7 +165,8 @@ def onboard(
     path = check_folder(folder)
     objects, held_out = resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
     if both := sorted(set(objects) & set(held_out)):
-        raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name other --objects or --held-out")
+        raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name others (objects=..., "
+                          "held_out=...)")
     require_known([hand], [*objects, *held_out])
     require_distinct([hand], objects)
     locate_weights(config.weights)
@@ -223,10 +224,20 @@ class _Onboarding:
     def run(self) -> None:
         """Run every step that is not finished."""
         self.step("check", self._check)
+        if "after" not in self.steps:
+            self.say(self.plan())
         self.step("before", lambda: self._benchmark(self.config.weights))
         self.step("data", self._data)
         self.step("training", self._training)
         self.step("after", lambda: self._benchmark(str(self.folder / WEIGHTS)))
+
+    def plan(self) -> str:
+        """What takes how long, in one line: the benchmarks are not cut off when the time is over."""
+        config = self.config
+        shares = (f"{config.minutes * share:.3g} min for {what}" for share, what in (
+            (config.data_share, "data"), (config.training_share, "training")))
+        return (f"{' and '.join(shares)}; two benchmarks, each of {config.num} grasps on {len(self.held_out)} objects, take as "
+                "long as they take: fewer objects and grasps are quicker (held_out=..., num=...)")
 
     def step(self, name: str, work: Callable[[], dict[str, Any]]) -> None:
         """Run a step unless it is finished, and store its result."""
@@ -255,10 +266,13 @@ class _Onboarding:
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
-        rows = benchmark([self.hand], objects, [Method(self.config.source, predictor)], config)
+        rows = benchmark([self.hand], objects, [Method(self.config.source, predictor)], config, self._count)
         told = "; ".join(map(_in_words, rows))
         share = f"{rows[-1].optimised:.0%} from the optimiser"
         return {"rows": [row.to_dict() for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
+
+    def _count(self, done: int, total: int) -> None:
+        self.say(f"benchmark: {done} of {total} objects")
 
     def _data(self) -> dict[str, Any]:
         config = self.config
@@ -269,7 +283,7 @@ class _Onboarding:
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
         failures = {obj: why for (_, obj), why in report.failures.items()}
         if not sum(counts.values()):
-            why = "; ".join(dict.fromkeys(failures.values())) or "too little time (--minutes)"
+            why = "; ".join(dict.fromkeys(failures.values())) or "too little time (minutes=...)"
             raise BundleError(f"no grasp of {self.name} held, so there is nothing to train on; look at "
                               f"{self.folder / PICTURE}, and at why: {why}")
         said = (f"{sum(counts.values())} grasps that hold under {config.engine.protocol}, of "

@@ -418,7 +418,8 @@ def begin(schedule: ScheduleConfig) -> tuple[Processes, str]:
     if device == "cuda":
         number, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
         if number >= there:
-            raise OptionError(f"process {number} finds no GPU of its own, there are {there} here; use --nproc-per-node {there}")
+            raise OptionError(f"process {number} finds no GPU of its own, there are {there} here; start it with "
+                              f"`torchrun --nproc-per-node {there}`")
         device = f"cuda:{number}"
         torch.cuda.set_device(number)
     if not distributed.is_initialized():

@@ -42,7 +42,7 @@ class Echo(RequestQueue):
 
     def submit(self, call: Any) -> Any:
         if call.id == "full":
-            raise ServerError("16 requests are waiting already; ask again later")
+            raise ServerError("16 requests are waiting already; ask again later", 2.4)
         reply: Future[Reply] = Future()
         reply.set_result(Reply(200, call.model_dump_json().encode()))
         return SimpleNamespace(reply=reply)
@@ -50,7 +50,7 @@ class Echo(RequestQueue):
     def cancel(self, name: str) -> bool:
         return name == "mine"
 
-    def close(self) -> None:
+    def close(self, patience: float = 0.0) -> None:
         self.closed = True
 
 
@@ -94,6 +94,9 @@ def test_a_request_is_answered_and_a_page_describes_it() -> None:
     (PLAIN | {"object": {}}, "one of name, file and points"), (PLAIN | {"object": {"points": [[0, 0]]}}, "object.points.0.2"),
     (PLAIN | {"object": {"file": {"name": "a.stl", "content": "?"}}}, "object.file.content"),
     (PLAIN | {"object": {"file": {"name": "a.stl", "content": None}}}, "content is no text"), ([], "the request"),
+    (PLAIN | {"num": True}, "num: "), (PLAIN | {"mass": True}, "mass"), (PLAIN | {"table": False}, "table"),
+    (PLAIN | {"direction": [0, 0, True]}, "direction"), (PLAIN | {"object": {"points": [[0, True, 0]]}}, "true is no number"),
+    (PLAIN | {"object": {"name": "can", "scale": True}}, "object.scale"),
     (PLAIN | {"id": "../x"}, "id: "), (PLAIN | {"camera": {"frame": "base", "T_frame_camera": [[1]]}}, "camera.T_frame_camera"),
 ])
 def test_a_request_that_is_none_is_told_why(body: Any, told: str) -> None:
@@ -124,7 +127,8 @@ def test_no_request_waits_for_a_name_server(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(("borne", "status"), [
-    (None, 401), ("Bearer other", 401), ("Bearer séc", 401), ("Bearer secret", 200)])
+    (None, 401), ("Bearer other", 401), ("Bearer séc", 401), ("secret", 401), ("Basic secret", 401), ("Bearersecret", 401),
+    ("Bearer", 401), ("Bearer secret", 200), ("bearer secret", 200), ("BEARER  secret", 200)])
 def test_a_token_opens_everything_and_nothing_else_does(borne: str | None, status: int) -> None:
     here, headers = client(token="secret"), {} if borne is None else {"Authorization": borne}
     for page in ("/hands", "/metrics", "/docs", "/openapi.json"):
@@ -158,7 +162,7 @@ def test_slow_bodies_are_refused() -> None:
 
 def test_a_full_queue_asks_to_come_again_and_a_request_can_be_cancelled() -> None:
     reply = client()("POST", "/grasps", PLAIN | {"id": "full"})
-    assert reply.status == 503
+    assert (reply.status, reply.headers["retry-after"]) == (503, "3")
     assert "ask again later" in reply.json()["error"]
     assert client()("DELETE", "/grasps/mine").json() == {"cancelled": "mine"}
     for unknown in (client()("DELETE", "/grasps/other"), client()("GET", "/nothing")):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -28,14 +30,21 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]
 OPTIONS: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
 
 
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    weights = str(untrained_weights(tmp_path_factory.mktemp("weights")))
+@contextmanager
+def serving(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A server's process and its address."""
+    weights = str(untrained_weights(folder))
     command = [sys.executable, "-m", "dro_grasp", "serve", "--port", "0", "--hand", "gripper3", "--weights", weights]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         yield process, process.stderr.readline().split()[2].rstrip(",")
         process.kill()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    with serving(tmp_path_factory.mktemp("weights")) as started:
+        yield started
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +98,33 @@ def test_sigterm_lets_a_request_end_and_closes_the_server(client: dro.GraspClien
     assert len(answers[0]["grasps"]) == 2
     assert process.stderr is not None
     assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
+def test_a_server_that_stops_tells_all_that_wait_and_its_log_is_quiet(tmp_path: Path, sign: signal.Signals) -> None:
+    told: list[str] = []
+    with serving(tmp_path) as (process, url):
+        client = dro.GraspClient(url)
+
+        def ask(num: int) -> None:
+            with pytest.raises(dro.DroGraspError) as refused:
+                client.predict("gripper3", "can", num, candidates=10, source="optimiser")
+            told.append(str(refused.value))
+
+        threads = [threading.Thread(target=ask, args=[100]) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        while (health := client.ask("GET", "/health"))["waiting"] < 3 or not health["computing"]:
+            time.sleep(0.02)
+        silent = socket.create_connection(url.removeprefix("http://").split(":"))  # type: ignore[arg-type]
+        process.send_signal(sign)
+        for thread in threads:
+            thread.join(40)
+        assert process.wait(40) == 0
+        silent.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+    assert told == ["the server is stopping; ask another one, or ask again once it runs"] * 4
 
 
 def test_a_small_load_loses_nothing(

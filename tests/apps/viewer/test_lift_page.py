@@ -103,7 +103,7 @@ def test_an_attempt_that_cannot_be_repeated_is_told(
     assert is_motion(tmp_path / "results.parquet")
     assert not is_motion(tmp_path / "none.parquet")
     assert main(["view", str(tmp_path / "results.parquet"), "--attempt", "1", "--port", str(free_port())]) == 2
-    assert "has attempts 0 to 0; --attempt is 1" in capsys.readouterr().err
+    assert "has attempts 0 to 0; --attempt 1 is none of them" in capsys.readouterr().err
     page = LiftPage(robot, [old], port=free_port())
     try:
         page._guarded(lambda: page.repeat(0))

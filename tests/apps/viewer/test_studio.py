@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import io
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
+import weakref
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 import trimesh
 import viser
+import websockets
 import yaml
 
 from dro_grasp.apps.viewer import grasp_page as module
@@ -21,11 +30,11 @@ from dro_grasp.apps.viewer.grasp_page import EXPORTS, GraspViewer, chosen, expor
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.cli.view import View
-from dro_grasp.errors import HandError
+from dro_grasp.errors import HandError, OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.predictor import GraspPredictor
@@ -351,6 +360,68 @@ def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, m
 
 
 @pytest.mark.slow
+def test_a_browser_runs_nothing_that_a_grasp_file_states(tmp_path: Path) -> None:
+    """An image with `onerror`, and a frame, wherever a file has text that the page shows."""
+    attack = "<img src=nowhere onerror=\"window.hit=1\"><iframe srcdoc=\"<script>parent.hit=1</script>\"></iframe>"
+    hand, obj = load_hand("gripper3"), load_object("sphere")
+    T = torch.eye(4)[None]
+    T[0, :3, 3] = -hand.grasp_centre_wrist
+    GraspBatch.create(
+        hand, obj, T, hand.canonical_joints(0.6)[None], success=torch.tensor([False]), protocol=("strict/1",)).replace(
+        hand=attack, hand_sha256="a" * 64, object=(attack,), object_sha256=("b" * 64,),
+        extra={REASON: [attack], CONTACT_LINKS: [[attack]]}).save(tmp_path / "g.parquet")
+    with page_of(str(tmp_path / "g.parquet"), "--hand", "gripper3", "--object", "sphere", size=(1280, 860)) as page:
+        page.get_by_text("touched by").first.wait_for(timeout=120_000)
+        time.sleep(2)
+        assert page.evaluate("window.hit") is None
+        assert page.locator("iframe").count() == page.locator("img[src=nowhere]").count() == 0
+        assert "onerror=" in page.locator("body").inner_text()
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0), "fov": 0.8, "near": 0.01,
+    "far": 100.0, "image_height": 600, "image_width": 800, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
+"""What a browser says first: with it, viser takes it for one."""
+
+
+async def visit(port: int, entered: threading.Event) -> None:
+    """Open the page as a browser does, and leave when it is there."""
+    protocol, origin = websockets.Subprotocol(f"viser-v{viser.__version__}"), websockets.Origin(f"http://{HOST}:{port}")
+    async with websockets.connect(f"ws://{HOST}:{port}", subprotocols=[protocol], origin=origin, max_size=None) as opened:
+        await opened.send(msgspec.msgpack.encode(CAMERA))
+        await asyncio.to_thread(entered.wait, 60)
+
+
+def test_pages_that_were_closed_leave_nothing_in_memory(studio: Studio) -> None:
+    """Pages refer to themselves, and Python looks for such waste rarely where much is loaded."""
+    entered, pages = threading.Event(), []
+
+    def make(client, turn):
+        made = Studio(client, studio.predictor, "gripper3", "sphere", turn, preview=False)
+        pages.append(weakref.ref(made))
+        entered.set()
+        return made
+
+    served = StudioServer(make, free_port(), HOST)
+    gc.disable()
+    try:
+        for _ in range(4):
+            entered.clear()
+            asyncio.run(visit(served.server.get_port(), entered))
+            end = time.monotonic() + 60
+            while served.studios and time.monotonic() < end:
+                time.sleep(0.05)
+        end = time.monotonic() + 10
+        while sum(page() is not None for page in pages) > 1 and time.monotonic() < end:
+            time.sleep(0.1)
+        assert len(pages) == 4
+        assert sum(page() is not None for page in pages) <= 1, "the last one may be on its way"
+    finally:
+        gc.enable()
+        served.stop()
+
+
+@pytest.mark.slow
 def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
     mesh, urdf = tmp_path / "block.stl", tmp_path / "mine.urdf"
     urdf.write_bytes((BUILTIN_FOLDER / "gripper3.urdf").read_bytes())
@@ -379,3 +450,30 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
         page.screenshot(path=tmp_path / "page.png", timeout=300_000)
     assert len(GraspBatch.load(saved)) == 16
     assert (tmp_path / "page.png").stat().st_size > 20_000
+
+
+def test_sigterm_removes_what_was_uploaded(tmp_path: Path) -> None:
+    code = ("import sys; from dro_grasp.apps.library import Library; from dro_grasp.apps.viewer.scene_view import serve\n"
+            "from types import SimpleNamespace; import time\n"
+            "library = Library(); library.take('a.stl', b'solid', 'object')\n"
+            "server = SimpleNamespace(sleep_forever=lambda: time.sleep(60))\n"
+            "serve(SimpleNamespace(url='here', server=server, stop=library.close))\n")
+    for sign in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True,
+                              env={**os.environ, "TMPDIR": str(tmp_path)}) as process:
+            assert process.stderr is not None
+            assert "viewer: here" in process.stderr.readline()
+            assert list(tmp_path.glob("dro-grasp-*/1/a.stl"))
+            time.sleep(0.3)
+            process.send_signal(sign)
+            assert process.wait(20) == 0
+            assert process.stderr.read() == ""
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_no_list_offers_is_no_path(studio: Studio, tmp_path: Path) -> None:
+    file = tmp_path / "secret.stl"
+    trimesh.creation.box([0.05] * 3).export(file)
+    for kind in ("hand", "object", "scene"):
+        with pytest.raises(OptionError, match=f"no {kind} is called '{file}' here"):
+            studio.library._of_name(kind, str(file), lambda name: pytest.fail(f"{name} is read"))

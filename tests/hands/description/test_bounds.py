@@ -19,7 +19,8 @@ from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 FINGER = ('<body name="f{0}" pos="{0}e-3 0 0"><joint name="j{0}" axis="0 1 0" range="0 1"/>'
           '<geom type="capsule" size="0.007" fromto="0 0 0 0 0 0.05" mass="0.1"/></body>')
 ATTACHED = '<body name="q"><attach model="m" body="{0}" prefix="x"/></body>'
-HEAVY = '<inertial><mass value="inf"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+HEAVY = '<inertial><origin xyz="0 0 1e30"/><mass value="1"/>' \
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 
 
 def mjcf(more: str = "", before: str = "", after: str = "") -> str:
@@ -39,7 +40,7 @@ def limits(upper: str, kind: str = "revolute") -> str:
     (claw(joints=limits("50", "prismatic")), r"the limits of joint 'a' are 0 50 m; expected at most 10 m"),
     (claw(joints=limits("1").replace("0 0 0.01", "1e30 0 0")), r"the origin of link 'left' is 1e\+30 0 0"),
     (claw(joints=limits("1").replace("0 0 0.01", "nan 0 0")), r"the origin of link 'left' is nan 0 0"),
-    (claw(links=link("left").replace("<visual>", f"{HEAVY}<visual>") + link("right")), "link 'left' is"),
+    (claw(links=link("left").replace("<visual>", f"{HEAVY}<visual>") + link("right")), "centre of mass of link 'left' is"),
     (claw(joints=joint("a", "palm", "left", "0 0 0.01", more=LIMIT + '<mimic joint="b" multiplier="nan"/>')
           + joint("b", "palm", "right", "0.035 0 0.01")), "the coefficients of the coupling of joint 'a' is 0 nan"),
 ])
@@ -50,6 +51,8 @@ def test_absurd_numbers_of_a_urdf_are_refused_by_name(tmp_path: Path, text: str,
 
 @pytest.mark.parametrize(("text", "message"), [
     (mjcf().replace("range=", 'ref="1e30" range=', 1), r"the reference of joint 'j1' is 1e\+30"),
+    (mjcf('<site name="eye" pos="0 -inf 0"/>', after='<equality><connect site1="eye" site2="eye"/></equality>'),
+     "the place of site 'eye' is 0 -inf 0"),
     (mjcf(after='<equality><joint joint1="j1" joint2="j30" polycoef="0 1e30 0 0 0"/></equality>'), "coupling of joint 'j1'"),
     (mjcf(after='<equality><joint joint1="j1"/><joint joint1="j30"/></equality>'), "every joint follows another"),
     (mjcf('<replicate count="1000000" euler="0 0 1"><body><geom size="0.01"/></body></replicate>'), "1000 links"),

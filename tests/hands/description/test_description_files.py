@@ -108,7 +108,7 @@ def test_meshes_are_found_under_encoded_uris(tmp_path, name):
     mesh.write_bytes(b"x")
     assert find_mesh(name, tmp_path / "my hand") == mesh
     assert find_mesh(f"file://{tmp_path}/my%20hand/meshes/left%20tip%231.stl", Path("/")) == mesh
-    assert find_mesh("meshes/left%20tip%231.stl", tmp_path / "my hand") is None, "a plain path is no URI"
+    assert find_mesh("meshes/left%20tip%231.stl", tmp_path / "my hand") == mesh, "though a plain path is no URI"
     literal.write_bytes(b"x")
     assert find_mesh(name.replace("my%20hand", "my hand"), tmp_path / "my hand") == literal, "the very name comes first"
 
@@ -133,11 +133,11 @@ def test_lost_collision_meshes_give_way_to_visual_shapes(tmp_path):
     assert stand_in.endswith(".obj")
     assert root.find("link/collision/geometry/mesh").get("filename") == stand_in
     assert ["was not found" in n.text or "visual shapes" in n.text for n in notes] == [True, True]
-    again = trimesh.load(trimesh.util.wrap_as_stream(as_obj(tmp_path / "box.ply")), file_type="obj")
+    again = trimesh.load(trimesh.util.wrap_as_stream(as_obj(tmp_path / "box.ply", [])), file_type="obj")
     assert again.volume == pytest.approx(1e-3)
 
 
 def test_a_mesh_in_no_known_format_is_refused(tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"nonsense")
     with pytest.raises(HandError, match=r"bad\.glb cannot be read"):
-        as_obj(tmp_path / "bad.glb")
+        as_obj(tmp_path / "bad.glb", [])

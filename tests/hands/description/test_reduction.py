@@ -7,7 +7,6 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import LEAST_MASS, Note, compile_hand
 from dro_grasp.hands.description.reduction import CONTINUOUS_LIMIT, keep_hand_only
 
@@ -55,7 +54,8 @@ def test_names_that_a_file_leaves_out_are_told() -> None:
     assert [note.subject for note in notes if "has no name" in note.text] == ["link_1_", "joint_0"]
 
 
-def test_ball_joints_are_refused() -> None:
+def test_a_ball_joint_becomes_three_hinges() -> None:
     finger = FINGER.replace("<joint name='bend' axis='0 1 0'", "<joint name='bend' type='ball'")
-    with pytest.raises(HandError, match="joint 'bend' is a ball joint; expected hinges"):
-        reduced(f"<body name='palm'><geom size='.02'/>{finger}</body>")
+    spec, notes = reduced(f"<body name='palm'><geom size='.02'/>{finger}</body>")
+    assert [joint.name for joint in spec.joints] == ["bend_x", "bend_y", "bend_z"]
+    assert [note.text for note in notes] == ["is a ball joint, taken as three hinges, bend_x, bend_y, bend_z"]

@@ -6,6 +6,7 @@ import io
 import json
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
@@ -106,23 +107,44 @@ def test_a_completed_scan_knows_which_of_its_points_were_seen(
     assert scanned_object("mug seen", points, T_object_camera, complete=False).seen is None
 
 
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ("millimetres", "divide millimetres by 1000"), ("mask of another size", "shape"), ("empty mask", "within the mask"),
-        ("nothing", "no pixel"),
-    ],
-)
-def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, word: str) -> None:
-    image, mask = depth.copy(), None
-    if change == "millimetres":
-        image *= 1000
-    elif change == "nothing":
-        image[:] = np.nan
-    else:
-        mask = np.zeros(SHAPE if change == "empty mask" else (5, 5), bool)
+@pytest.mark.parametrize(("mask", "word"), [(np.zeros((5, 5), bool), "shape"), (np.zeros(SHAPE, bool), "within the mask")])
+def test_masks_that_show_nothing_are_refused(depth: np.ndarray, mask: np.ndarray, word: str) -> None:
     with pytest.raises(ObjectError, match=word):
-        depth_points(image, INTRINSICS, mask)
+        depth_points(depth, INTRINSICS, mask)
+
+
+@pytest.mark.parametrize(("median", "units"), [
+    (45.0, ["0.45 m in centimetres (divide by 100)"]),
+    (600.0, ["6 m in centimetres (divide by 100)", "0.6 m in millimetres (divide by 1000)"]),
+    # A room in millimetres, or a bench in tenths of one: only who knows the camera knows which.
+    (3500.0, ["3.5 m in millimetres (divide by 1000)", "0.35 m in tenths of a millimetre (divide by 10000)"]),
+    (450000.0, ["0.45 m in micrometres (divide by 1000000)"]),
+    (1e9, ["too far for any unit"]),
+])
+def test_depths_in_other_units_are_refused_with_all_that_they_may_be(median: float, units: list[str]) -> None:
+    with pytest.raises(ObjectError) as caught:
+        depth_points(np.full(SHAPE, median), INTRINSICS)
+    told = str(caught.value)
+    assert all(unit in told for unit in units)
+    assert told.count("divide by") == sum("divide by" in unit for unit in units)
+
+
+def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:
+    part = depth[10:80, 60:150]
+    matrix = INTRINSICS - np.array([[0, 0, 60.0], [0, 0, 10], [0, 0, 0]])
+    whole = depth_points(depth, INTRINSICS)
+    near = KDTree(whole).query(depth_points(part, matrix))[0]
+    assert near.max() < 1e-9
+
+
+def test_a_scan_drops_and_counts_pixels_without_a_return(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points, gaps = depth_points(depth, INTRINSICS), np.concatenate([np.zeros((500, 3)), np.full((200, 3), np.nan)])
+    clean = scanned_object("mug", points, T_object_camera)
+    dirty = scanned_object("mug", np.concatenate([points, gaps]), T_object_camera)
+    assert dirty.sha256 == clean.sha256
+    assert f"700 of {len(points) + 700} points are none (NaN, or 0 0 0 for no return) and were dropped" in dirty.notes
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, int, float, list, torch.as_tensor])
@@ -186,6 +208,40 @@ def test_a_pose_that_is_none_is_refused(depth: np.ndarray, T_object_camera: np.n
         T[:3, 3] = [400.0, 0, 800.0]
     with pytest.raises(OptionError, match="T_frame_camera is not the camera's pose"):
         scanned_object("mug", depth_points(depth, INTRINSICS), T)
+
+
+def ball_before_a_camera() -> tuple[np.ndarray, np.ndarray]:
+    """Points of the near side of a ball half a metre off [m], and its normals, which are exact."""
+    normals = np.random.default_rng(0).normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] < -0.2]
+    return 0.04 * normals + [0, 0, 0.5], normals
+
+
+@pytest.mark.parametrize(("given", "used", "told"), [
+    (lambda n: n, True, None), (lambda n: -n, True, "pointed away from the camera and were turned"),
+    (lambda n: np.where(np.arange(len(n))[:, None] % 2 == 0, n, -n), False, "to both sides of one surface, so they were not"),
+    (lambda n: np.where(n[:, :1] > 0, n, -n), False, "do not all face the camera, so they were not"),
+    (lambda n: n * np.linspace(0.1, 5, len(n))[:, None], False, "not all one length, so they were not used"),
+    (lambda n: 0 * n, False, "not all one length, so they were not used")])
+def test_normals_of_a_camera_s_file_are_used_where_they_face_it(
+    given: Any, used: bool, told: str | None, tmp_path: Path, T_object_camera: np.ndarray
+) -> None:
+    points, normals = ball_before_a_camera()
+    rows = np.column_stack([1000 * points, given(normals)])
+    head = "".join(f"property double {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    text = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{head}end_header\n"
+    (tmp_path / "scan.ply").write_text(text + "\n".join(" ".join(map(repr, row)) for row in rows.tolist()))
+    scan = load_scan(tmp_path / "scan.ply", T_object_camera, 0.001)
+    assert scan.seen is not None
+    index = KDTree(scan.cloud).query(scan.seen)[1]
+    R, t = T_object_camera[:3, :3], T_object_camera[:3, 3]
+    centre = R @ [0, 0, 0.5] + t
+    off = np.abs(scan.cloud_normals[index] - (scan.seen - centre) / 0.04).max(1)
+    assert (np.median(off) < 1e-4) == used
+    assert np.median(off) < 0.3, "estimated ones face the camera as well"
+    assert [note for note in scan.notes if "its normals" in note] == [note for note in scan.notes if told and told in note]
+    assert any("its normals" in note for note in scan.notes) == (told is not None)
 
 
 @pytest.mark.parametrize("scale", [-1.0, 0.0, float("nan")])
@@ -269,19 +325,6 @@ def test_what_depth_cameras_leave_behind_is_dropped(
     obj = load_scan(tmp_path / "raw.npy", T_object_camera)
     assert float(np.ptp(obj.cloud, axis=0).max()) < 0.2
     assert np.quantile(off_surface(mug, obj.cloud.astype(float)), 0.5) < 0.003
-
-
-@pytest.mark.parametrize(("content", "word"), [
-    ({"T_frame_camera": np.eye(4).tolist()}, "no entry 'frame'"),
-    ({"frame": "base"}, "no entry 'T_frame_camera'"),
-    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "not a name"),
-    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "not a name"),
-    ({"frame": "base", "T_frame_camera": [[1, 0, 0, 400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "millimetres"),
-])
-def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: str, tmp_path: Path) -> None:
-    (tmp_path / "frame.json").write_text(json.dumps(content))
-    with pytest.raises(OptionError, match=word):
-        read_motion(tmp_path / "frame.json", "T_frame_camera")
 
 
 def on_a_table(seen: np.ndarray, T_object_camera: np.ndarray) -> np.ndarray:

@@ -252,7 +252,7 @@ def test_folders_of_other_settings_or_commands_are_refused(stored, tmp_path):
         filter_dataset(pairs, other, FilterConfig((changed("dro"),)))
     with pytest.raises(OptionError, match="name one at least"):
         FilterConfig(())
-    with pytest.raises(OptionError, match="--resettle"):
+    with pytest.raises(OptionError, match="resettle=True"):
         FilterConfig((changed("dro"),), again=True)
     with pytest.raises(OptionError, match="give at least 1"):
         filter_dataset(pairs, tmp_path, FilterConfig((changed("dro"),)), workers=0)

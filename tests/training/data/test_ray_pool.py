@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import socket
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -51,7 +56,7 @@ def ray_starts() -> None:
     pytest.importorskip("ray")
     start = "import ray; ray.init(address='local', num_cpus=1, include_dashboard=False)"
     try:
-        subprocess.run([sys.executable, "-c", start], capture_output=True, timeout=90, check=True)
+        subprocess.run([sys.executable, "-c", start], capture_output=True, timeout=240, check=True)
     except subprocess.SubprocessError as error:
         pytest.skip(f"Ray starts no node on this machine: {error}")
 
@@ -84,6 +89,15 @@ def test_an_address_where_nobody_listens_is_told_at_once():
             RayPool(Job(0, EngineConfig()), 1, 60.0, address)
 
 
+def test_a_script_that_cannot_be_imported_again_is_told(tmp_path):
+    pytest.importorskip("ray")
+    code = ("from dro_grasp.training.data.engine.pools import RayPool; from dro_grasp.training.data.engine.worker import *\n"
+            "RayPool(Job(0, EngineConfig()), 1, 60.0)")
+    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 1
+    assert "ClusterError: the process that joins the Ray cluster ended as it began; give it a script" in done.stderr
+
+
 def test_without_ray_the_engine_says_what_to_install(monkeypatch):
     from dro_grasp.training.data.engine.pools import RayPool
     from dro_grasp.training.data.engine.worker import EngineConfig
@@ -91,3 +105,89 @@ def test_without_ray_the_engine_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(OptionError, match=r"pip install 'dro-grasp\[ray\]'"):
         RayPool(Job(0, EngineConfig()), 1, 60.0)
+
+
+DRIVER = """
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dro_grasp.errors import DroGraspError
+from dro_grasp.training.data.engine.schedule import synthesize_dataset
+from dro_grasp.training.data.engine.pools import RayPool
+from tests.helpers.engine_work import slow
+
+if __name__ == "__main__":
+    try:
+        synthesize_dataset(["a", "b"], ["x", "y"], int(sys.argv[2]), sys.argv[1],
+                           workers=lambda job: RayPool(job, 1, 60, None, slow))
+    except DroGraspError as error:
+        sys.exit(f"error: {error}")
+"""
+
+
+def raylets_below(process: int) -> list[int]:
+    """Processes of Ray's nodes among the descendants of a process."""
+    below, commands = {process}, {}
+    for stat in sorted(Path("/proc").glob("[0-9]*/stat"), key=lambda path: int(path.parent.name)):
+        with suppress(OSError):
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            commands[int(stat.parent.name)] = parent, (stat.parent / "cmdline").read_bytes()
+    while more := {number for number, (parent, _) in commands.items() if parent in below} - below:
+        below |= more
+    return [number for number in below if number in commands and b"raylet/raylet" in commands[number][1]]
+
+
+@contextmanager
+def driver(folder: Path, grasps: int) -> Iterator[subprocess.Popen[str]]:
+    """A run on a cluster of its own, whose node runs."""
+    script = folder / "driver.py"
+    script.write_text(DRIVER)
+    path = os.pathsep.join(map(str, [ROOT, ROOT / "src"]))
+    with subprocess.Popen([sys.executable, script, folder / "data", str(grasps)], stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}) as process:
+        yield process
+        process.kill()
+
+
+def killed_raylet(process: subprocess.Popen[str], folder: Path, shards: int) -> None:
+    """Kill the node when there are so many shards."""
+    while process.poll() is None and len(list((folder / "data").glob("*/*/*.parquet"))) < shards:
+        time.sleep(0.1)
+    while process.poll() is None and not (found := raylets_below(process.pid)):
+        time.sleep(0.1)
+    for number in found:
+        os.kill(number, signal.SIGKILL)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_starts")
+@pytest.mark.parametrize("shards", [0, 2])
+def test_a_node_that_dies_below_its_driver_is_told_and_the_next_run_goes_on(tmp_path, shards):
+    with driver(tmp_path, 300) as process:
+        killed_raylet(process, tmp_path, shards)
+        told = process.communicate(timeout=200)
+    assert process.returncode == 1
+    assert re.search("error: (the Ray node of this machine died|Ray could not start a node on this machine)", told[1])
+    assert told[0] == ""
+    made = len(find_shards(tmp_path / "data"))
+    assert made >= shards
+    with driver(tmp_path, 5 * max(made, 4)) as process:
+        process.communicate(timeout=200)
+        assert process.returncode == 0
+    assert not raylets_below(process.pid)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_starts")
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_driver_that_is_killed_leaves_no_cluster_behind(tmp_path, sign):
+    with driver(tmp_path, 300) as process:
+        while not (left := raylets_below(process.pid)):
+            time.sleep(0.1)
+        process.send_signal(sign)
+        process.communicate(timeout=60)
+    end = time.monotonic() + 60
+    while any(Path(f"/proc/{number}/exe").exists() for number in left) and time.monotonic() < end:
+        time.sleep(0.2)
+    assert not [number for number in left if Path(f"/proc/{number}/exe").exists()]

@@ -14,6 +14,7 @@ from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import grasp_file
 from dro_grasp.grasps.batch import DUPLICATE_DISTANCE, GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.cutting import CutShortError
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import read_collection
@@ -36,6 +37,13 @@ def test_every_pair_gets_its_first_shard_before_any_gets_its_second(tmp_path):
     assert report.grasps == report.added == 18 * GRASPS
     assert report.shards == 18
     assert not report.failures
+
+
+def test_hands_take_turns_so_that_a_run_that_ends_early_has_grasps_of_all(tmp_path):
+    _, tasks, _ = run(tmp_path, ["a", "b", "c"], ["x", "y", "z"], 5)
+    hands = [task.shard.hand for task in tasks]
+    assert [hands[:3], hands[3:6], hands[6:]] == [["a", "b", "c"]] * 3
+    assert len({(task.shard.hand, task.shard.object) for task in tasks}) == 9
 
 
 def test_a_rerun_does_only_what_is_missing_and_a_higher_goal_extends(tmp_path):
@@ -137,7 +145,7 @@ def test_the_next_pair_is_idle_and_has_the_fewest_rounds():
 
 def test_an_object_that_is_being_prepared_is_left_to_one_worker():
     states = {(hand, obj): PairState() for hand in "ab" for obj in "xy"}
-    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("a", "y")
+    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "y")
     states["a", "x"].total = Yield(candidates=64)  # then its parts are in the cache
     states["a", "y"].done = states["b", "y"].done = {0}
     assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "x")
@@ -163,7 +171,7 @@ def test_impossible_requests_are_refused_before_the_work(tmp_path):
 def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     config = EngineConfig(synthesis=SynthesisConfig(device="cuda"))
-    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use --device cpu"):
+    with pytest.raises(OptionError, match=r"device is 'cuda', but .* use device='cpu'"):
         synthesize_dataset(["a"], ["x"], 1, tmp_path, config=config)
 
 
@@ -263,19 +271,18 @@ def test_a_hand_that_cannot_hold_the_object_is_told_why(tmp_path):
     assert report.grasps >= 1  # of the can
 
 
-def test_an_object_that_coacd_cannot_cut_is_told_in_one_line(tmp_path, monkeypatch):
-    import coacd
-
+def test_an_object_that_cannot_be_cut_is_told_in_one_line(tmp_path, monkeypatch):
     def fail(*args, **kwargs):
-        raise RuntimeError("assertion failed")
+        raise CutShortError("assertion failed")
 
-    monkeypatch.setattr(coacd, "run_coacd", fail)
+    monkeypatch.setattr("dro_grasp.objects.convex_parts.cut_apart", fail)
     monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path / "cache"))
     torus = trimesh.creation.torus(0.05, 0.015)
     torus.export(tmp_path / "ring.stl")
     (tmp_path / "data").mkdir()
     report, _, lines = run(tmp_path / "data", ["barrett"], [str(tmp_path / "ring.stl")], 1, make_shard, config=TINY)
-    assert "cut into convex parts (assertion failed)" in report.failures["barrett", str(tmp_path / "ring.stl")]
+    why = report.failures["barrett", str(tmp_path / "ring.stl")]
+    assert "cut into convex parts: CoACD failed (assertion failed), and V-HACD failed" in why
     assert any("ring.stl: the mesh cannot be cut" in line for line in lines)
 
 

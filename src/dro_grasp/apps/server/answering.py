@@ -30,8 +30,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
-from dro_grasp.objects.perception.scan import scanned_object
-from dro_grasp.objects.reading import read_points
+from dro_grasp.objects.perception.scan import load_scan, scanned_object
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.config import GraspRequest
@@ -125,8 +124,8 @@ class Answerer:
             HandError: The server knows no such hand.
         """
         if name not in (known := self.hand_names()):
-            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with --hand FILE for "
-                            "another one")
+            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with "
+                            f"`dro-grasp serve --hand FILE` for another one")
         return self.library.hand(name)
 
     def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
@@ -140,7 +139,7 @@ class Answerer:
             raise OptionError("a camera is given, and the object is named; send the cloud that the camera saw")
         if sent.name is not None and sent.name not in (known := self.object_names()):
             raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
-                              "/objects); send the mesh or cloud, or start the server with --object FILE")
+                              "/objects); send the mesh or cloud, or start it with `dro-grasp serve --object FILE`")
         key = content_key(sent, camera)
         return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
 
@@ -164,8 +163,9 @@ class Answerer:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
             check_scale(sent.scale)
             T, named = sent_pose(camera), isinstance(source, Path)
-            points = read_points(source) if named else source
-            return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+            if named:
+                return load_scan(source, T.numpy(), sent.scale, sent.keep_table)
+            return scanned_object("cloud", source * sent.scale, T.numpy(), keep_table=sent.keep_table)
 
 
 def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
+import time
+import uuid
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError, URLError
@@ -58,27 +60,40 @@ class GraspClient:
         options = {present(name, FORMER_CONSTRAINTS): value for name, value in options.items()}
         if options.get("obstacles") is not None:
             options["obstacles"] = sent_object(options["obstacles"])
-        return self.ask("POST", "/grasps", {"hand": hand, "object": sent_object(obj) | of_object, "num": num, **options})
+        call = {"hand": hand, "object": sent_object(obj) | of_object, "num": num, "id": uuid.uuid4().hex, **options}
+        return self.ask("POST", "/grasps", call)
 
     def cancel(self, name: str) -> None:
         """Cancel the request of this id."""
         self.ask("DELETE", f"/grasps/{name}")
 
     def ask(self, method: str, page: str, content: dict[str, Any] | None = None) -> Any:
-        """What a page of the server answers.
+        """What a page of the server answers; where it is busy, it is asked again when it says, until the timeout.
 
         Raises:
             OptionError: The content cannot be sent.
             ServerError: It refuses, fails or is not there.
         """
         body = None if content is None else json.dumps(content, default=listed).encode()
+        end = time.monotonic() + self.timeout
+        while True:
+            try:
+                return self._asked(method, page, body)
+            except ServerError as error:
+                if error.retry_after is None or time.monotonic() + error.retry_after > end:
+                    raise
+                time.sleep(error.retry_after)
+
+    def _asked(self, method: str, page: str, body: bytes | None) -> Any:
         try:
             with urlopen(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
                 return json.load(answer)
         except HTTPError as error:
             with error:
                 why = error.read().decode(errors="replace")
-            raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}") from error
+                again = error.headers.get("Retry-After", "")
+            raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}",
+                              float(again) if again.isdecimal() else None) from error
         except TimeoutError as error:
             raise ServerError(f"the grasp server at {self.url} gave no answer in {self.timeout:g} s; ask for fewer grasps, or "
                               "give GraspClient a longer timeout") from error

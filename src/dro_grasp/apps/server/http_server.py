@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
+import math
 import signal
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -20,13 +20,14 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
-from dro_grasp.apps.origins import own_names, refusal
+from dro_grasp.apps.origins import LOCAL, own_names, refusal, same_token
+from dro_grasp.apps.server.connections import Limits, within
 from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
 from dro_grasp.errors import OptionError, ServerError
 
 SHUTDOWN_TIMEOUT = 10.0  # Time that requests under way get to end when the server is stopped [s] (ours)
-MAX_CONNECTIONS = 128  # Most open connections (ours)
+BACKLOG = 128  # Most connections that wait to be taken (ours)
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,9 @@ class Access:
     body_seconds: float = 30.0  # Time within which the whole of a request must arrive [s] (ours)
 
     def __post_init__(self) -> None:
-        if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
-            raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
-                              "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
+        if self.host not in LOCAL and not self.token:
+            raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (token=..., "
+                              "or the environment variable DRO_GRASP_TOKEN), or serve this machine only (host='127.0.0.1')")
         if not 0 < self.megabytes <= 1000:
             raise OptionError(f"megabytes is {self.megabytes}; give a number above 0, and at most 1000")
 
@@ -59,14 +60,15 @@ class Gate:
             if reply is not None:
                 await sent(reply)(scope, receive, send)
                 return
-            receive = self._limited(receive)
+            receive = self._limited(receive, scope.get("state", {}).get("since"))
         await self.app(scope, receive, send)
 
     def _refusal(self, headers: Headers, path: str) -> Reply | None:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
-        borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
-        if self.access.token and path != "/health" and not secrets.compare_digest(borne, self.access.token.encode()):
+        scheme, _, borne = headers.get("Authorization", "").partition(" ")
+        known = scheme.lower() == "bearer" and same_token(borne.strip(), self.access.token or "")
+        if self.access.token and path != "/health" and not known:
             return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
                                                     "header 'Authorization: Bearer TOKEN'")
         length = headers.get("Content-Length", "0")
@@ -78,10 +80,13 @@ class Gate:
     def _too_large(self) -> str:
         return f"the request has more than {self.access.megabytes:g} MB; simplify the mesh or thin out the cloud"
 
-    def _limited(self, receive: Any) -> Any:
-        """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits."""
+    def _limited(self, receive: Any, since: float | None) -> Any:
+        """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits.
+
+        Time runs from its first byte, where that is known.
+        """
         size, whole, seconds = 0, False, self.access.body_seconds
-        deadline = asyncio.get_running_loop().time() + seconds
+        deadline = (asyncio.get_running_loop().time() if since is None else since) + seconds
 
         async def part() -> Any:
             nonlocal size, whole
@@ -103,7 +108,8 @@ class Gate:
 
 def sent(reply: Reply) -> Response:
     """A reply as it is sent."""
-    return Response(reply.body, reply.status, media_type="application/json")
+    headers = None if reply.retry_after is None else {"Retry-After": str(math.ceil(reply.retry_after))}
+    return Response(reply.body, reply.status, headers, media_type="application/json")
 
 
 def application(queue: RequestQueue, access: Access) -> FastAPI:
@@ -162,7 +168,7 @@ async def _answered(queue: RequestQueue, call: Any, request: Request) -> Reply:
         taken = queue.submit(call)
     except ServerError as error:
         queue.metrics.replies[int(HTTPStatus.SERVICE_UNAVAILABLE)] += 1
-        return refused(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+        return refused(HTTPStatus.SERVICE_UNAVAILABLE, str(error), error.retry_after)
     reply, gone = asyncio.wrap_future(taken.reply), asyncio.ensure_future(_left(request))
     try:
         await asyncio.wait({reply, gone}, return_when=asyncio.FIRST_COMPLETED)
@@ -208,23 +214,48 @@ def metrics_text(queue: RequestQueue) -> str:
 def listening_socket(host: str, port: int) -> socket.socket:
     """A socket that listens at an address."""
     if not 0 <= port < 2**16:
-        raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
+        raise OptionError(f"port is {port}; give a number up to 65535, for example port=8090, or 0 for any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=MAX_CONNECTIONS)
+        return socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
-        raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another --port, or --host "
-                          "127.0.0.1 for this machine only") from error
+        raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another port, or "
+                          "host='127.0.0.1' for this machine only") from error
+
+
+class StoppingServer(uvicorn.Server):
+    """uvicorn's server, which ends requests under way without a word when it stops; here they are told why."""
+
+    def __init__(self, config: uvicorn.Config, queue: RequestQueue) -> None:
+        super().__init__(config)
+        self.queue = queue
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close the queue while uvicorn waits for replies, and then whatever connection is left."""
+        closing = asyncio.ensure_future(self._close())
+        await super().shutdown(sockets)
+        if self.force_exit:
+            self.queue.hurry()
+        await closing
+
+    async def _close(self) -> None:
+        await asyncio.to_thread(self.queue.close, SHUTDOWN_TIMEOUT)
+        for _ in range(10):  # replies are on their way
+            if not self.server_state.connections:
+                return
+            await asyncio.sleep(0.1)
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
 
 
 def serve_grasps(queue: RequestQueue, access: Access, listener: socket.socket) -> None:
-    """Serve until SIGTERM or Ctrl-C; requests under way get SHUTDOWN_TIMEOUT to end, and the queue is closed."""
+    """Serve until SIGTERM or Ctrl-C; what is computed gets SHUTDOWN_TIMEOUT to end, what waits is refused at once."""
     signal.signal(signal.SIGTERM, lambda *_: None)  # uvicorn raises it again once it has stopped
     config = uvicorn.Config(
-        application(queue, access), log_level="warning", access_log=False, limit_concurrency=MAX_CONNECTIONS,
-        timeout_graceful_shutdown=int(SHUTDOWN_TIMEOUT), server_header=False)
+        application(queue, access), http=within(Limits(head_seconds=access.body_seconds)), ws="none", log_level="warning",
+        access_log=False, timeout_graceful_shutdown=int(2 * SHUTDOWN_TIMEOUT), server_header=False)
     try:
-        uvicorn.Server(config).run(sockets=[listener])
+        StoppingServer(config, queue).run(sockets=[listener])
     except KeyboardInterrupt:
         pass
     finally:

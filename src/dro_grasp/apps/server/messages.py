@@ -10,17 +10,28 @@ import uuid
 from collections.abc import Callable
 from dataclasses import MISSING, fields
 from itertools import pairwise
-from typing import Any, Literal, TypeVar, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, create_model, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, create_model, field_validator, model_validator
 
 from dro_grasp.kinds import FORMER_CONSTRAINTS, FORMER_SOURCES
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 
 MAX_POINTS = 200_000  # Most points of a cloud that is sent as numbers (ours); files may hold more
-Point = tuple[float, float, float]
-Row = tuple[float, float, float, float]
+
+
+def no_truth(given: Any) -> Any:
+    """What is given; true and false are no numbers, although Python counts with them."""
+    if isinstance(given, bool):
+        raise ValueError(f"{str(given).lower()} is no number; give one")
+    return given
+
+
+Number = Annotated[float, BeforeValidator(no_truth)]
+Point = tuple[Number, Number, Number]
+Row = tuple[Number, Number, Number, Number]
 FORMER_FIELDS = FORMER_CONSTRAINTS | {"method": "source"}  # Fields of a request, as they were called, and are
 Settings = TypeVar("Settings")
 
@@ -56,7 +67,7 @@ class SentObject(Message):
     """A mesh or cloud file, whole; it cannot name other files."""
     points: list[Point] | None = Field(None, max_length=MAX_POINTS)
     """A point cloud [m]."""
-    scale: float = 1.0
+    scale: Number = 1.0
     """Multiplies the coordinates; 0.001 for millimetres."""
     keep_table: bool = False
     """Take every point of a cloud for the object's; by default a table in it is found and cut off."""
@@ -87,7 +98,7 @@ class _Call(Message):
     """Name of a hand that the server knows."""
     object: SentObject
     """What to grasp."""
-    mass: float | None = None
+    mass: Number | None = None
     """Mass of the object [kg], which the grasps shall carry; null for density times volume."""
     camera: SentCamera | None = None
     """Where the cloud was seen from; without one, it is taken to be in the frame of the grasps."""
@@ -126,9 +137,20 @@ WIRE_TYPES: dict[str, Any] = {"obstacles": SentObject | None, "source": Literal[
 
 def fields_of(settings: type[Any]) -> dict[str, Any]:
     """Type, default and description of a dataclass's fields, as pydantic takes them."""
-    types, told = get_type_hints(settings) | WIRE_TYPES, field_docs(settings)
+    hints, told = get_type_hints(settings) | WIRE_TYPES, field_docs(settings)
+    types = {name: without_truths(kind) for name, kind in hints.items()}
     return {f.name: (types[f.name], Field(... if f.default is MISSING else f.default, description=told.get(f.name)))
             for f in fields(settings)}
+
+
+def without_truths(kind: Any) -> Any:
+    """A type whose numbers are neither true nor false."""
+    if kind in {int, float}:
+        return Annotated[kind, BeforeValidator(no_truth)]
+    if not (parts := get_args(kind)) or get_origin(kind) is Literal:
+        return kind
+    within = tuple(without_truths(part) for part in parts)
+    return Union[within] if get_origin(kind) in {Union, UnionType} else get_origin(kind)[within]  # noqa: UP007
 
 
 def field_docs(settings: type[Any]) -> dict[str, str]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent import futures
+from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -28,13 +31,20 @@ class Reply(NamedTuple):
 
     status: int
     body: bytes
+    retry_after: float | None = None  # When it is worth while to ask again [s]
 
 
-def refused(status: HTTPStatus, why: str) -> Reply:
+def refused(status: HTTPStatus, why: str, retry_after: float | None = None) -> Reply:
     """A reply that says why there is no answer."""
-    return Reply(status, json.dumps({"error": why}).encode())
+    return Reply(status, json.dumps({"error": why}).encode(), retry_after)
 
 
+TICKETS = 8  # Most refused requests whose turn is remembered, as a multiple of the queue's length (ours)
+LATE_SECONDS = 3.0  # How much later than it was told a refused request may come without losing its turn [s] (ours)
+USUAL_SECONDS = 2.0  # Computing time of a request, before any is known [s] (ours)
+STOP_SECONDS = 1.0  # How long a process that was terminated waits to hear whether the server stops [s] (ours)
+STOPPED = refused(HTTPStatus.SERVICE_UNAVAILABLE, "the server is stopping; ask another one, or ask again once it runs")
+"""The reply to a request that a stopping server does not answer any more."""
 CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")  # The reply to a request that is no longer wanted
 
 
@@ -139,6 +149,9 @@ class RequestQueue:
         self.config, self.longest, self.time_limit, self.answerer, self.grace = config, longest, time_limit, answerer, grace
         self.metrics, self.closed = Metrics(), False
         self._known: dict[str, Request] = {}
+        self._tickets: dict[str, float] = {}
+        """Refused requests by their ids, in order, and until when each keeps its turn."""
+        self._hurry: Future[Reply] = Future()
         self._running: Request | None = None
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
@@ -167,19 +180,40 @@ class RequestQueue:
     def submit(self, call: Any) -> Request:
         """Put a request into the queue.
 
+        Where the queue is full, requests are refused in turn: each is told when to come again, and one that does so under the
+        same id finds its place kept from those who come later.
+
         Raises:
             ServerError: The queue is full or closed, or a request of the same id is under way.
         """
         with self._lock:
             if self.closed:
-                raise ServerError("the server is stopping; ask another one")
+                raise ServerError("the server is stopping; ask another one, or ask again once it runs")
             if call.id in self._known:
                 raise ServerError(f"a request '{call.id}' is under way; give each its own id")
-            if self.waiting >= self.longest:
-                raise ServerError(f"{self.waiting} requests are waiting already; ask again later")
+            if (missing := self._ahead(call.id) + 1 - (self.longest - self.waiting)) > 0:
+                raise self._later(call, missing)
+            self._tickets.pop(call.id, None)
             request = self._known[call.id] = Request(call, next(self._numbers))
             request.turn = self._turns.submit(self._work, request)
         return request
+
+    def _ahead(self, name: str) -> int:
+        """How many refused requests have an older turn than that of this id; the lock is held."""
+        now = time.monotonic()
+        self._tickets = {other: until for other, until in self._tickets.items() if until > now}
+        return list(self._tickets).index(name) if name in self._tickets else len(self._tickets)
+
+    def _later(self, call: Any, missing: int) -> ServerError:
+        """A refusal that says when the missing places are free; the lock is held."""
+        done = sum(self.metrics.replies[status] for status in (HTTPStatus.OK, HTTPStatus.UNPROCESSABLE_ENTITY))
+        usual = self.metrics.computing_seconds / done if done else USUAL_SECONDS
+        seconds = min(max(1.0, missing * usual), self.time_limit)
+        # An id that nobody chose does not come again.
+        if "id" in call.model_fields_set and (call.id in self._tickets or len(self._tickets) < TICKETS * self.longest):
+            self._tickets[call.id] = time.monotonic() + seconds + LATE_SECONDS
+        return ServerError(f"{self.waiting} requests are waiting already; ask again later, in {math.ceil(seconds)} s and "
+                           "under the same id to keep your turn", seconds)
 
     def cancel(self, name: str) -> bool:
         """End a request, in the queue or under way; whether there is one of this id.
@@ -202,17 +236,27 @@ class RequestQueue:
         request.reply.set_result(CANCELLED)
         return True
 
-    def close(self) -> None:
-        """Refuse what waits, and end the process."""
+    def close(self, patience: float = 0.0) -> None:
+        """Refuse what waits, give what is computed some time to end [s], and end the process."""
         with self._lock:
             self.closed = True
-            names, running = list(self._known), self._running
-        for name in names:
-            self.cancel(name)
-        if running is not None:  # only now, so that none that waits takes its place
+            running = self._running
+            waiting = [request for request in self._known.values() if request.turn is not None and request.turn.cancel()]
+            for request in waiting:
+                self._forget(request, STOPPED)
+        for request in waiting:
+            request.reply.set_result(STOPPED)
+        if running is not None:
+            if patience > 0:
+                futures.wait([running.reply, self._hurry], patience, futures.FIRST_COMPLETED)
             running.abandon()
         self._turns.shutdown()
         self._end()
+
+    def hurry(self) -> None:
+        """Let `close` wait no longer."""
+        with suppress(InvalidStateError):
+            self._hurry.set_result(STOPPED)
 
     def _work(self, request: Request) -> None:
         """Reply to a request whose turn it is, and see that there is a process for the next one."""
@@ -236,8 +280,11 @@ class RequestQueue:
         self.metrics.replies[int(reply.status)] += 1
         del self._known[request.call.id]
 
-    def _computed(self, request: Request) -> tuple[Reply, bool]:
-        """The reply to a request, and whether its process is still alive."""
+    def _computed(self, request: Request, again: bool = False) -> tuple[Reply, bool]:
+        """The reply to a request, and whether its process is still alive.
+
+        Where somebody else killed the process, or the system for want of memory, the request is computed once again.
+        """
         try:
             if not self._pool.active:
                 self._end()
@@ -247,13 +294,26 @@ class RequestQueue:
                 request.abandon()
             return request.task.result(), True
         except CancelledError:
-            return CANCELLED, False
+            return STOPPED if self.closed else CANCELLED, False
         except TimeoutError:
             return refused(HTTPStatus.GATEWAY_TIMEOUT, f"the request took longer than {self.time_limit:g} s and was ended; ask "
                                                        "for fewer grasps or candidates"), False
         except (ProcessExpired, BrokenProcessPool, RuntimeError, DroGraspError) as error:
+            if self._stops(error):
+                return STOPPED, False
+            if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGKILL and not again:
+                self._end()
+                return self._computed(request, again=True)
             return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"the process died over this request ({type(error).__name__}: "
                                                              f"{error}); it starts anew"), False
+
+    def _stops(self, error: BaseException) -> bool:
+        """Whether the process ended because the server does: a service manager ends both at once."""
+        if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGTERM:
+            begin = time.monotonic()
+            while not self.closed and time.monotonic() - begin < STOP_SECONDS:
+                time.sleep(0.05)
+        return self.closed
 
     def _start(self) -> None:
         """Start the process, and wait until it has loaded; raises what loading raises."""

@@ -246,7 +246,7 @@ class GraspViewer(ServedPage, GraspPage):
             GraspFileError: The grasps belong to another hand.
         """
         if len(grasps) == 0:
-            raise OptionError("there is no grasp to view; generate at least one, or leave out --only-successful")
+            raise OptionError("there is no grasp to view; generate at least one")
         grasps.require_hand(hand)
         ServedPage.__init__(self, port, host)
         GraspPage.__init__(self, self.server)

@@ -74,7 +74,7 @@ class LiftPage(ServedPage, Page):
 
     def __init__(
         self, robot: Robot, attempts: Sequence[Attempt] = (), weights: str | None = None, port: int = 8080, host: str = HOST,
-        make: Callable[..., Attempt] = attempt,
+        make: Callable[..., Attempt] = attempt, token: str | None = None,
     ) -> None:
         """Start serving with the robot at home.
 
@@ -84,7 +84,7 @@ class LiftPage(ServedPage, Page):
             make: Runs them.
         """
         self.robot, self.attempts, self.weights, self.make = robot, list(attempts), weights, make
-        ServedPage.__init__(self, port, host)
+        ServedPage.__init__(self, port, host, token)
         Page.__init__(self, self.server)
         self.film: Film | None = None
         self._add_controls()
@@ -223,7 +223,7 @@ class LiftPage(ServedPage, Page):
 
 def lift_page(
     file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST,
-    make: Callable[..., Attempt] = attempt,
+    make: Callable[..., Attempt] = attempt, token: str | None = None,
 ) -> LiftPage:
     """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
 
@@ -231,14 +231,15 @@ def lift_page(
     """
     if file.suffix.lower() == ".npz":
         plan = MotionPlan.load(file)
-        page = LiftPage(load_robot(robot or plan.notes.robot), (), weights, port, host)
+        page = LiftPage(load_robot(robot or plan.notes.robot), (), weights, port, host, token=token)
         page.show(Film.of_plan(page.robot, plan))
         return page
     attempts = read_attempts(file)
     if not 0 <= chosen < len(attempts):
-        raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; --attempt is {chosen}")
+        raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; attempt={chosen} is none of them")
     if robot is not None:
         attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
-    page = LiftPage(load_robot(attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host, make)
+    first = load_robot(attempts[chosen].robot_file or attempts[chosen].robot)
+    page = LiftPage(first, attempts, weights, port, host, make, token)
     page.repeat(chosen)
     return page

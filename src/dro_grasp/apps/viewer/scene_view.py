@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http
 import math
 import re
+import secrets
+import signal
 import socket
 import sys
 import threading
 import time
+import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -22,9 +27,10 @@ import websockets.asyncio.server
 from jaxtyping import Float
 from torch import Tensor
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import MultipleValuesError
 from websockets.http11 import Request, Response
 
-from dro_grasp.apps.origins import own_names, refusal
+from dro_grasp.apps.origins import LOCAL, cookie_of, own_names, refusal, same_token, token_in_address, token_in_cookie
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.hands.hand import Hand
@@ -32,6 +38,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures import appearance
 
 MAX_CONNECTIONS = 64  # Most open connections to one page (ours)
+TOKEN_BYTES = 16  # Length of a token that is made up [bytes]
 HOST = "127.0.0.1"  # Default address: only this machine can connect
 POINT_SIZE = 0.0022  # Size of a drawn point [m]
 CAMERA_DISTANCE = 1.15  # Initial camera distance, as a multiple of that of a picture
@@ -41,6 +48,7 @@ RAISED = 0.27  # Share of its height by which hand and object then stand above t
 GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 
 Point = tuple[float, float, float]  # A place [m]
+Handler = Callable[[ServerConnection], Awaitable[None]]  # What talks with one browser
 Client = viser.ViserServer | viser.ClientHandle  # Whose page it is: that of all browsers, or of one
 
 
@@ -155,28 +163,86 @@ def rgb(colour: Colour) -> tuple[int, int, int]:
 
 
 @contextlib.contextmanager
-def guarded_server(served_at: str) -> Iterator[None]:
-    """Servers of viser that start within the block refuse foreign requests, and more than MAX_CONNECTIONS.
+def guarded_server(served_at: str, token: str | None = None) -> Iterator[None]:
+    """Servers of viser that start within the block refuse foreign requests, those without the token, and too many.
 
     viser has no switch for it; it passes a function that sees every request to websockets, and this one is put before it.
     """
     serve, own = websockets.asyncio.server.serve, own_names(served_at)
 
-    def guarded(*args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
+    def guarded(handler: Handler, *args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
         def check(connection: ServerConnection, request: Request) -> Response | None:
             crowd = len(getattr(connection.server, "connections", ())) > MAX_CONNECTIONS
-            why = "too many browsers show it; close some" if crowd else refusal(request.headers, own)
+            why = "too many browsers show it; close some" if crowd else foreign(request, own)
             if why:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"This page refuses the request: {why}.\n")
+            if token and (answer := asked_for_token(connection, request, token)) is not None:
+                return answer
             return None if process_request is None else process_request(connection, request)
 
-        return serve(*args, process_request=check, **options)
+        return serve(unmoved(handler), *args, process_request=check, **options)
 
     websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def foreign(request: Request, own: frozenset[str]) -> str:
+    """Why a request is refused; empty if it is not."""
+    try:
+        return refusal(request.headers, own)
+    except MultipleValuesError:
+        return "it states its Host or Origin twice"
+
+
+def asked_for_token(connection: ServerConnection, request: Request, token: str) -> Response | None:
+    """The answer to a request that bears the token in its address, or not at all; None if the browser has it already."""
+    if same_token(token_in_address(request.path), token):
+        answer = connection.respond(http.HTTPStatus.SEE_OTHER, "")
+        answer.headers["Location"] = "/"
+        answer.headers["Set-Cookie"] = f"{cookie_of(token)}={quote(token, safe='')}; Path=/; HttpOnly; SameSite=Lax"
+        return answer
+    if same_token(token_in_cookie("; ".join(request.headers.get_all("Cookie")), token), token):
+        return None
+    return connection.respond(http.HTTPStatus.UNAUTHORIZED, "This page needs a token: open the address that `dro-grasp view` "
+                                                            "prints, which ends with it.\n")
+
+
+def unmoved(handler: Handler) -> Handler:
+    """A handler of connections that closes those whose messages cannot be understood, and says so in one line."""
+    async def handle(connection: ServerConnection) -> None:
+        asyncio.get_running_loop().set_exception_handler(_tell_misunderstood)
+        try:
+            await handler(connection)
+        except Exception as error:
+            if not came_in(error):
+                raise
+            _misunderstood(error)
+            await connection.close(1003, "the message was not understood")
+
+    return handle
+
+
+def came_in(error: BaseException | None) -> bool:
+    """Whether an error arose where viser reads messages of browsers."""
+    while error is not None:
+        if {"_message_consumer", "_handle_incoming_message"} & {f.name for f in traceback.extract_tb(error.__traceback__)}:
+            return True
+        error = error.__context__
+    return False
+
+
+def _tell_misunderstood(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    if came_in(error := context.get("exception")):
+        _misunderstood(error)
+    else:
+        loop.default_exception_handler(context)
+
+
+def _misunderstood(error: BaseException | None) -> None:
+    print(f"viewer: a browser's message was not understood ({type(error).__name__})", file=sys.stderr, flush=True)
 
 
 def escaped(text: object) -> str:
@@ -252,24 +318,27 @@ class Page(ABC):
 class ServedPage:
     """Pages that are being served; `stop()` ends them."""
 
-    def __init__(self, port: int, host: str) -> None:
+    def __init__(self, port: int, host: str, token: str | None = None) -> None:
         """Start serving at an address of this machine, 0.0.0.0 being the whole network; a port that is taken is counted up.
+
+        Where others can connect, their browsers must know a token; one is made up if none is given.
 
         Raises:
             OptionError: The port is invalid, or the host is no address of this machine.
         """
         if not 0 < port < 2**16:
-            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example --port 8080")
+            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example port=8080")
         if not host:
-            raise OptionError(f"host is empty; give --host {HOST} for this machine only, or 0.0.0.0 for the whole network")
+            raise OptionError(f"host is empty; give host={HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
             # viser would search for a free port forever.
             socket.create_server((host, 0)).close()
         except OSError as error:
-            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine only, or "
+            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give host={HOST} for this machine only, or "
                               "0.0.0.0 for the whole network") from error
         # viser prints a banner to stdout, which is reserved for tables and JSON.
-        with contextlib.redirect_stdout(sys.stderr), guarded_server(host):
+        self.token = token or (None if host in LOCAL else secrets.token_urlsafe(TOKEN_BYTES))
+        with contextlib.redirect_stdout(sys.stderr), guarded_server(host, self.token):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -277,8 +346,9 @@ class ServedPage:
 
     @property
     def url(self) -> str:
-        """Address of the page for a browser."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        """Address of the page for a browser, with the token if it needs one."""
+        token = "" if self.token is None else f"/?token={quote(self.token, safe='')}"
+        return f"http://{self.server.get_host()}:{self.server.get_port()}{token}"
 
     def stop(self) -> None:
         """Stop serving and free the port."""
@@ -286,11 +356,34 @@ class ServedPage:
 
 
 def serve(page: ServedPage) -> None:
-    """Print the address of the page, and serve it until Ctrl-C."""
+    """Print the address of the page, and serve it until Ctrl-C, SIGTERM or the end of the terminal."""
     print(f"viewer: {page.url} (Ctrl-C stops it)", file=sys.stderr, flush=True)
+    with signals_as_interrupts():
+        try:
+            page.server.sleep_forever()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            page.stop()
+
+
+@contextlib.contextmanager
+def signals_as_interrupts() -> Iterator[None]:
+    """Within the block, what would end the process at once is a KeyboardInterrupt first, and then disregarded."""
+    taken = {}
+    if threading.current_thread() is threading.main_thread():
+        signs = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        taken = {sign: signal.SIG_DFL for sign in signs if signal.getsignal(sign) is signal.SIG_DFL}  # nohup ignores SIGHUP
+
+    def interrupt(*_: object) -> None:
+        for sign in taken:
+            signal.signal(sign, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for sign in taken:
+        signal.signal(sign, interrupt)
     try:
-        page.server.sleep_forever()
-    except KeyboardInterrupt:
-        pass
+        yield
     finally:
-        page.stop()
+        for sign, before in taken.items():
+            signal.signal(sign, before)

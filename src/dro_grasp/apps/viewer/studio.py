@@ -5,6 +5,7 @@ Every browser has a page of its own.
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable
@@ -252,9 +253,12 @@ class StudioServer(ServedPage):
         >>> server = StudioServer(lambda client, turn: Studio(client, predictor, turn=turn))
     """
 
-    def __init__(self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
+    def __init__(
+        self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST,
+        token: str | None = None,
+    ) -> None:
         """Start serving; `make` makes the page of a browser, with a lock that is the same for all."""
-        super().__init__(port, host)
+        super().__init__(port, host, token)
         self._make, self._turn = make, threading.Lock()
         self.studios: dict[int, Studio] = {}
         """Pages that are open, by the browser's number."""
@@ -280,3 +284,5 @@ class StudioServer(ServedPage):
     def _close(self, number: int) -> None:
         if (studio := self.studios.pop(number, None)) is not None:
             studio.close()
+            del studio
+            gc.collect()  # pages refer to themselves, and hold meshes; Python alone looks for such waste rarely

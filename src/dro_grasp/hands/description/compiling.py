@@ -37,7 +37,7 @@ NUMBERS = (
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
     ("joint", "jnt_range", "limits", MAX_TURN), ("joint", "qpos0", "reference", TURNS),
     ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", 1e9),
-    ("coupling", "eq_data", "coefficients", TURNS),
+    ("site", "site_pos", "place", MAX_LENGTH), ("coupling", "eq_data", "coefficients", TURNS),
 )
 """Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
 masses, which MuJoCo derives from them where a file states none."""
@@ -67,6 +67,8 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
             body.mass = LEAST_MASS
     with mujoco_speaks_to(notes, path):
         model = _compile(spec, notes)
+        if _drop_giants(spec, model, notes):
+            model = _compile(spec, notes)
     _check_numbers(model, path)
     notes.extend(_limit_notes(model))
     return model
@@ -80,6 +82,31 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
             if not _repair(spec, str(error), notes):
                 raise
     return spec.copy().compile()
+
+
+def _drop_giants(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[Note]) -> bool:
+    """Leave out meshes larger than any hand where all links that have them have other shapes, which then collide.
+
+    In published files these are collision meshes in millimetres beside visual ones in metres. True if any were left out.
+    """
+    sizes = {model.mesh(m).name: float(np.ptp(model.mesh_vert[start : start + count], axis=0).max())
+             for m, (start, count) in enumerate(zip(model.mesh_vertadr, model.mesh_vertnum, strict=True))}
+    giants = {name for name, size in sizes.items() if size > MAX_LENGTH}
+    bodies = [body for body in list(spec.bodies)[1:] if giants & {geom.meshname for geom in body.geoms}]
+    if not all(any(geom.meshname not in giants for geom in body.geoms) for body in bodies):
+        return False
+    for body in bodies:
+        for geom in [geom for geom in body.geoms if geom.meshname in giants]:
+            spec.delete(geom)
+        if not any(geom.contype or geom.conaffinity for geom in body.geoms):
+            for geom in body.geoms:
+                geom.contype = geom.conaffinity = 1
+    if bodies:
+        notes.append(Note("warning", ", ".join(body.name for body in bodies), f"meshes of up to {max(sizes.values()):.0f} m, "
+                          "perhaps in millimetres, are left out, and other shapes collide instead; state the meshes' scale"))
+    for mesh in [mesh for mesh in spec.meshes if mesh.name in giants]:
+        spec.delete(mesh)
+    return bool(bodies)
 
 
 def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
@@ -124,6 +151,10 @@ def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
         if np.abs(model.jnt_range[j]).max() > MAX_LENGTH:
             raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
                             f"at most {MAX_LENGTH:g} m; this looks like millimetres: scale the file by 0.001")
+    # MuJoCo divides an axis by its length, which overflows.
+    for j in np.flatnonzero(~(np.linalg.norm(model.jnt_axis, axis=1) > 0.5)):
+        raise HandError(f"{path}: the axis of joint '{model.joint(j).name}' is beyond all numbers; expected a direction, "
+                        "such as 0 0 1")
     for kind, array, what, largest in NUMBERS:
         values = np.asarray(getattr(model, array), float)
         values = values[:, None] if values.ndim == 1 else values[:, :4]
@@ -173,7 +204,8 @@ def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
         return f"the coupling of joint '{model.joint(first).name}'" if of_joint else f"the tie number {index}"
     if kind == "vertex":
         return f"mesh '{model.mesh(int(np.searchsorted(model.mesh_vertadr, index, 'right')) - 1).name}'"
-    return f"{kind} '{(model.body if kind == 'link' else model.joint)(index).name}'"
+    named = {"link": model.body, "site": model.site, "joint": model.joint}[kind]
+    return f"{kind} '{named(index).name}'"
 
 
 def _told(values: Float[np.ndarray, " n"]) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from urllib.parse import unquote
 
 import mujoco
 import numpy as np
@@ -21,14 +22,19 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
-from dro_grasp.hands.description.reduction import keep_hand_only
+from dro_grasp.hands.description.dialects import MOST_UNKNOWN, drop_unknown
+from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
+from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
-from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
+from dro_grasp.hands.description.urdf import CONTINUOUS, MOVING, as_obj, in_any_case, prepare_urdf
+from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
 OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use it)
+CLOSED = "closed"  # Name of the one towards which joints close (ours)
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
@@ -47,8 +53,8 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
             (arm_in_urdf if arm else part_of_urdf)(root, link, path)
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
-        stated = open_state(srdf) if os.path.isfile(srdf) else {}
-        files = (*files, srdf) if stated else files
+        states = [read_state(srdf, name) if os.path.isfile(srdf) else {} for name in (OPEN, CLOSED)]
+        files = (*files, srdf) if any(states) else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
         if link is not None and arm:
@@ -56,13 +62,18 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
         elif link is not None:
             spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
-            stated = open_key(spec)
+            states = [read_key(spec, name) for name in (OPEN, CLOSED)]
+        spec = spec if link is not None else with_palm_of_world(spec, path, notes)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    notes.extend(keep_hand_only(spec, path, fixed_base=arm))
+    in_vain = {note.subject for note in notes if CONTINUOUS in note.text and not arm}
+    notes.extend(note for note in keep_hand_only(spec, path, fixed_base=arm)
+                 if not (note.text.startswith(NO_LIMITS) and note.subject in in_vain))
     model = compile_hand(spec, path, notes)
+    if not arm:
+        model = lightened(spec, model, path, notes)
     tree = read_tree(model, path, notes)
-    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
+    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), *states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +89,8 @@ class Description:
     notes: tuple[Note, ...]  # findings and repairs
     open_posture: Mapping[str, float]
     """The open posture that the file, or the SRDF beside it, states, by joint [rad or m]; empty if it states none."""
+    closed_posture: Mapping[str, float]
+    """Values towards which joints close, likewise."""
 
     @property
     def name(self) -> str:
@@ -130,27 +143,84 @@ class Description:
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
     xml, files, converted = prepare_urdf(root, path, notes)
-    assets = {name: as_obj(file) for name, file in converted.items()}
+    assets = {name: as_obj(file, notes) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
         return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
-    included = included_files(root, path)
+    path, included = _with_included(root, path)
     if path.suffix.lower() != ".xml":
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
-    with mujoco_speaks_to(notes, path):
-        spec = mujoco.MjSpec.from_file(str(path))
-    if not any("angle" in c.attrib for tree in (root, *map(parse_xml, included)) for c in tree.iter("compiler")):
+    trees = {path: root, **{file: parse_xml(file) for file in included}}
+    spec = _spec_of(trees, path, notes)
+    mend_empty_inertials(spec, notes)
+    if not any("angle" in c.attrib for tree in trees.values() for c in tree.iter("compiler")):
         notes.extend(guess_unit(spec))
+    _find_files(spec, path, notes)
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
+    if pointers := sorted(str(file) for file in used if os.path.isfile(file) and is_pointer(file)):
+        raise HandError(f"{path}: {len(pointers)} files of meshes or textures are pointers of Git LFS (first: {pointers[0]}); "
+                        f"{FETCH}")
     missing = sorted(str(file) for file in used if not os.path.isfile(file))
     if missing:
         raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
                         "there or correct meshdir and texturedir")
     return spec, (*included, *meshes)
+
+
+def _with_included(root: ET.Element, path: Path) -> tuple[Path, tuple[Path, ...]]:
+    """An MJCF and the files that it includes; where it is a link and they lie beside its target, the target."""
+    try:
+        return path, included_files(root, path)
+    except HandError:
+        if not path.is_symlink():
+            raise
+        return path.resolve(), included_files(root, path.resolve())
+
+
+def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Point meshes and textures, in place, to files that lie beside a link's target or are spelled in another case."""
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        if not asset.file or os.path.isfile(path.parent / (folder or "") / asset.file):
+            continue
+        likely = [parent / (folder or "") / unquote(asset.file) for parent in (path.parent, path.resolve().parent)]
+        file = next(filter(None, map(in_any_case, likely)), None)
+        if file is not None:
+            notes.append(Note("warning", asset.file, f"was not found, and {file.resolve()} is taken for it"))
+            asset.file = str(file.resolve())
+
+
+def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
+    """What MuJoCo reads from a file and those that it includes, mended in memory where MuJoCo would not read them."""
+    mended = any([mend_mjcf_inertials(tree, notes) for tree in trees.values()])
+    with mujoco_speaks_to(notes, path):
+        for _ in range(MOST_UNKNOWN):
+            try:
+                spec = _spec_in_memory(trees, path) if mended else mujoco.MjSpec.from_file(str(path))
+                break
+            except ValueError as error:
+                if not drop_unknown(str(error), trees.values(), notes):
+                    raise
+                mended = True
+        else:
+            spec = _spec_in_memory(trees, path)
+    return spec
+
+
+def _spec_in_memory(trees: Mapping[Path, ET.Element], path: Path) -> mujoco.MjSpec:
+    """The specification of a file and those that it includes as they are in memory; assets are pointed to their files."""
+    text, *more = (ET.tostring(tree) for tree in trees.values())
+    names = [os.path.relpath(file, path.parent) for file in trees if file != path]
+    spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
+    spec.modelfiledir = str(path.parent)
+    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
+        beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
+        if asset.file and beside.is_file() and not (path.parent / (folder or "") / asset.file).is_file():
+            asset.file = str(beside)
+    return spec
 
 
 def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
@@ -162,25 +232,25 @@ def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
     return digest.hexdigest()
 
 
-def open_state(srdf: Path) -> dict[str, float]:
-    """Joints in every `<group_state name="open">` of an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
+def read_state(srdf: Path, name: str) -> dict[str, float]:
+    """Joints in every `<group_state>` of this name in an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
     stated = {}
     for state in parse_xml(srdf).iter("group_state"):
-        for joint in state.iter("joint") if state.get("name") == OPEN else ():
+        for joint in state.iter("joint") if state.get("name") == name else ():
             try:
                 stated[joint.get("name", "")] = float(joint.get("value", ""))
             except ValueError as error:
-                raise HandError(f"{srdf}: the state '{OPEN}' has value=\"{joint.get('value')}\" for joint "
+                raise HandError(f"{srdf}: the state '{name}' has value=\"{joint.get('value')}\" for joint "
                                 f"'{joint.get('name')}'; expected one number") from error
     return stated
 
 
-def open_key(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Joint values of the keyframe `open` of an MJCF [rad or m]; empty if it has none."""
-    if not any(key.name == OPEN for key in spec.keys):
+def read_key(spec: mujoco.MjSpec, name: str) -> dict[str, float]:
+    """Joint values of the keyframe of this name in an MJCF [rad or m]; empty if it has none."""
+    if not any(key.name == name for key in spec.keys):
         return {}
     model = spec.copy().compile()
-    values = model.key_qpos[model.key(OPEN).id]
+    values = model.key_qpos[model.key(name).id]
     single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
     joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
     return {model.joint(j).name: float(values[model.jnt_qposadr[j]]) for j in joints}
@@ -225,6 +295,7 @@ def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
     ends = _ends(root)
     kept = _below(ends, link)
     _require(link, [element.get("name", "") for element in root.findall("link")], path)
+    _require_fingers(link, {below: (above, joint.get("type") in MOVING) for joint, (above, below) in ends.items()}, path)
     for joint, (above, below) in ends.items():
         if above not in kept or below == link:
             root.remove(joint)
@@ -271,7 +342,10 @@ def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
 
 def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
     """A body of an MJCF and what hangs on it, with the couplings, tendons, actuators and keyframes of its joints."""
-    _require(link, [body.name for body in list(spec.bodies)[1:]], path)
+    bodies = list(spec.bodies)[1:]
+    _require(link, [body.name for body in bodies], path)
+    _require_fingers(link, {body.name: (body.parent.name, bool(body.joints)) for body in bodies
+                             if body.parent.name != "world"}, path)
     part = mujoco.MjSpec()
     part.compiler.degree = spec.compiler.degree
     with mujoco_speaks_to([], path):  # of its options, all of which the protocol sets
@@ -295,6 +369,31 @@ def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
     while grown := {below for above, below in ends.values() if above in found} - found:
         found |= grown
     return found
+
+
+def _require_fingers(link: str, tree: Mapping[str, tuple[str, bool]], path: Path) -> None:
+    """Refuse a link on which nothing moves, by a HandError that names the one above it on which something does.
+
+    Args:
+        link: The link at which the hand should begin.
+        tree: For each link but the root, its parent and whether it moves against it.
+        path: The file.
+    """
+    def carries(top: str) -> bool:
+        found = {top}
+        while grown := {below for below, (above, _) in tree.items() if above in found} - found:
+            found |= grown
+        return any(tree[below][1] for below in found - {top})
+
+    if carries(link):
+        return
+    above = link
+    for _ in tree:  # as often as there are links; a cycle is reported when the tree is built
+        if above in tree and not tree[above][1] and not carries(above):
+            above = tree[above][0]
+    hint = f"; the fingers hang on '{above}', which carries it: give {named(path.name, above)}" if carries(above) else \
+        ", so no hand begins there; give the link that the fingers hang on"
+    raise HandError(f"{path}: nothing that hangs on link '{link}' moves{hint}")
 
 
 def _require(link: str, links: Sequence[str], path: Path) -> None:

@@ -20,9 +20,16 @@ from scipy.optimize import least_squares
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
+from dro_grasp.hands.description.tendon_limits import tie_by_limits
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
+BALL_LIMIT = math.pi / 2  # Limits of the three hinges of a ball that states none, both ways from zero [rad] (ours)
+SPECK = 0.004
+"""Extent below which spheres and boxes are no part of a finger [m] (ours); stand-ins of published hands have 2 mm."""
+PLAIN = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE,
+         mujoco.mjtGeom.mjGEOM_ELLIPSOID}
+"""Shapes whose size is stated."""
 SLIDE_LIMIT = 0.05  # Limits of slides that state none, both ways from zero [m] (ours)
 
 
@@ -30,7 +37,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
-    HandError: nothing moves, or a joint is neither a hinge nor a slide.
+    HandError: nothing moves, or a joint within the hand is free.
     """
     notes: list[Note] = []
     hand = _largest_tree(spec, path)
@@ -38,6 +45,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     driven = driven_joints(spec)
     _limit_joints_as_actuators(spec)
     _couple_tendons(spec, notes)
+    tie_by_limits(spec, driven, notes)
     for kind in (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.cameras, spec.lights, spec.tuples, spec.skins):
         for item in list(kind):
             spec.delete(item)
@@ -55,8 +63,10 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
             spec.delete(joint)
     if not fixed_base:
         _free_wrist(spec, hand, notes)
+    _hold_specks(spec, hand, notes)
+    passive = _split_balls(spec, driven, path, notes)
     _check_joints(spec, path, notes)
-    couple_closed_loops(spec, driven, path, notes)
+    couple_closed_loops(spec, driven, path, notes, passive)
     for tendon in list(spec.tendons):
         spec.delete(tendon)
     _keep_joint_equalities(spec, notes)
@@ -74,6 +84,44 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
             spec.delete(joint)
         below = list(link.bodies)
         link = below[0] if len(below) == 1 and not list(link.geoms) else None
+
+
+def _hold_specks(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:
+    """Delete, in place, joints that move nothing but specks and lead nothing: links that stand for motors are no fingers."""
+    tied = {name for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT for name in (e.name1, e.name2)}
+    still: list[mujoco.MjsJoint] = []
+    for body in [each for each in spec.bodies if each.name not in {"world", hand.name}]:
+        shapes = body.find_all("geom")
+        if shapes and all(shape.type in PLAIN and 2 * float(np.max(shape.size)) < SPECK for shape in shapes):
+            still.extend(joint for joint in body.joints if joint.name not in tied)
+    for joint in still if len(still) < len(spec.joints) else ():  # where all are so small, it is the unit
+        notes.append(Note("info", joint.name, f"moves nothing but shapes of less than {1000 * SPECK:.0f} mm, as those of links "
+                          "that stand for motors; taken as fixed"))
+        spec.delete(joint)
+
+
+def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[Note]) -> set[str]:
+    """Replace, in place, ball joints by three hinges; the names of those that no actuator moves, which loops may."""
+    passive: set[str] = set()
+    for ball in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_BALL]:
+        body, name = ball.parent, ball.name
+        if list(body.joints)[-1] != ball:
+            raise HandError(f"{path}: joint '{name}' is a ball joint before another joint of link '{body.name}'; expected "
+                            "it last, or three hinges")
+        limit = float(ball.range[1]) or (math.degrees(BALL_LIMIT) if spec.compiler.degree else BALL_LIMIT)
+        stated = {"pos": ball.pos.copy(), "stiffness": ball.stiffness, "range": [-limit, limit],
+                  "actfrclimited": ball.actfrclimited, "actfrcrange": ball.actfrcrange.copy(),
+                  "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
+        names = [f"{name}_{letter}" for letter in "xyz"]
+        spec.delete(ball)
+        for each, axis in zip(names, np.eye(3), strict=True):
+            body.add_joint(name=each, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, **stated)
+        if name in driven:
+            driven.update(names)
+        else:
+            passive.update(names)
+        notes.append(Note("info", name, f"is a ball joint, taken as three hinges, {', '.join(names)}"))
+    return passive
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
@@ -114,6 +162,9 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
     for tendon in spec.tendons:
         wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
+        if tendon.name in driven and (pulled := _pulled(tendon)):
+            notes.append(Note("warning", tendon.name, f"is a tendon over sites that an actuator pulls; what it moves "
+                              f"({', '.join(pulled)}) is taken as free: state by <equality> how these joints follow"))
         if tendon.name not in driven or len(wraps) < 2:
             continue
         first = wraps[0]
@@ -127,6 +178,21 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
             equality.data[:2] = [0.0, first.coef / other.coef]
             notes.append(Note("info", other.target.name, f"shares tendon '{tendon.name}' with "
                               f"'{first.target.name}' and moves with it"))
+
+
+def _pulled(tendon: mujoco.MjsTendon) -> list[str]:
+    """Names of the joints between the sites of a spatial tendon; empty for one that runs over joints, or over one of them."""
+    paths = []
+    for wrap in tendon.path:
+        if wrap.type != mujoco.mjtWrap.mjWRAP_SITE or wrap.target is None:
+            continue
+        body, path = wrap.target.parent, []
+        while body is not None and body.name != "world":
+            path, body = [body, *path], body.parent
+        paths.append({each.name: [joint.name for joint in each.joints] for each in path})
+    shared = set.intersection(*map(set, paths)) if paths else set()
+    between = {joint: None for path in paths for name, joints in path.items() if name not in shared for joint in joints}
+    return list(between) if len(between) > 1 else []
 
 
 def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
@@ -153,23 +219,48 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 
 def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
-    """Give unlimited joints limits; refuse ball joints, inner free joints, and more joints than any hand has."""
+    """Give unlimited joints limits; refuse inner free joints, and more joints than any hand has."""
     if (count := len(list(spec.joints))) > MAX_JOINTS:
         raise HandError(f"{path} has {count} joints; expected at most {MAX_JOINTS}, fix those that are not the hand's")
+    _hold_joints_without_range(spec, path, notes)
     for joint in spec.joints:
-        if joint.type in {mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE}:
-            kind = "ball" if joint.type == mujoco.mjtJoint.mjJNT_BALL else "free"
-            raise HandError(f"{path}: joint '{joint.name}' is a {kind} joint; expected hinges and slides (use three hinges)")
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            raise HandError(f"{path}: joint '{joint.name}' is a free joint; expected hinges, slides and balls")
         limited = joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE or (
             joint.limited == mujoco.mjtLimited.mjLIMITED_AUTO and joint.range[0] < joint.range[1])
         if not limited:
             slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
             limit = SLIDE_LIMIT if slides else CONTINUOUS_LIMIT
+            vain = f" that count ({told})" if (told := _told_range(joint.range)) else ""
             # Angles are in the unit of the file, and compiled from there.
             stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
             joint.range = [-stated, stated]
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-            notes.append(Note("warning", joint.name, f"{NO_LIMITS}; taken as +-{limit:.2f}"))
+            notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
+
+
+def _told_range(limits: Sequence[float] | Float[np.ndarray, "2"]) -> str:
+    """Limits that a joint states but that do not count, in words; empty if it states none."""
+    low, high = limits
+    return "" if low == high == 0 else f"{low:g} to {high:g}" + ("" if low >= high else ", but limited is 'false'")
+
+
+def _hold_joints_without_range(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Hold joints, in place, that are limited to one value, which MuJoCo refuses. HandError: no other joint moves."""
+    still = [j for j in spec.joints if j.limited == mujoco.mjtLimited.mjLIMITED_TRUE and j.range[0] == j.range[1]]
+    if still and len(still) == len(list(spec.joints)):
+        raise HandError(f"{path} has no moving joint: both limits of {len(still)} joints are equal "
+                        f"({', '.join(joint.name for joint in still[:3])}{', ...' if len(still) > 3 else ''}); "
+                        "state their limits")
+    led = {equality.name1 for equality in spec.equalities if is_linear(equality)}
+    for joint in still:
+        unit = math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        value = float(joint.range[0])
+        joint.range = [value - STILL * unit, value + STILL * unit]
+        notes.append(Note("warning", joint.name, f"has both limits at {value:g} and is held there"))
+        if joint.name not in led:
+            tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=joint.name)
+            tie.data[0] = (value - float(joint.ref)) / unit
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
@@ -181,6 +272,7 @@ def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 
 Joints = Float[np.ndarray, " n"]  # a value of each joint
+Sweeps = dict[int, Float[np.ndarray, "_ n"]]  # by leader, joint values while it goes through its range
 CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
 STEPS = 32  # Steps from one end of a leader's range to the other (ours)
 SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)
@@ -210,7 +302,7 @@ def _limit_joints_as_actuators(spec: mujoco.MjSpec) -> None:
     for actuator in spec.actuators:
         if not (force := _largest_force(actuator)):
             continue
-        shares = {actuator.target: abs(float(actuator.gear[0]))}
+        shares = {actuator.target: float(np.abs(actuator.gear[:3]).max())}  # a ball's gear has three numbers
         if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON and actuator.target in tendons:
             shares = {w.target.name: abs(w.coef * actuator.gear[0]) for w in tendons[actuator.target].path
                       if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None}
@@ -228,18 +320,70 @@ def _largest_force(actuator: mujoco.MjsActuator) -> float:
     return float(abs(actuator.gainprm[0]) * np.abs(actuator.ctrlrange).max()) if motor else 0.0
 
 
-def couple_closed_loops(spec: mujoco.MjSpec, driven: Collection[str], path: Path, notes: list[Note]) -> None:
-    """Replace, in place, ties of closed loops by joint equalities that driven joints lead; ties that cannot be closed stay."""
-    if not any(e.active and not is_linear(e) for e in spec.equalities):
+def couple_closed_loops(
+    spec: mujoco.MjSpec, driven: Collection[str], path: Path, notes: list[Note], passive: Collection[str] = ()
+) -> None:
+    """Replace, in place, ties of closed loops by joint equalities that driven joints lead; ties that cannot be closed stay.
+
+    Passive joints lead nothing: what ties leave free of them stays as it is.
+    """
+    if not spec.joints or not any(e.active and not is_linear(e) for e in spec.equalities):
         return
     linkage, ties = Linkage(spec, path), [e for e in spec.equalities if e.active]
     for group in linkage.groups():
-        leaders = linkage.leaders(group, driven)
-        sweeps = {leader: linkage.sweep(group, leaders, leader) for leader in leaders}
+        motors = linkage.sweeps(group, driven, passive)
+        balls = len(motors) > 1 and linkage.names(group) & set(passive)
+        sweeps = _led_by_fingers(linkage, group, motors, driven, passive, notes) if balls else motors
         if sweeps and all(len(sweep) > 1 for sweep in sweeps.values()):
             for tie in group.ties:
                 spec.delete(ties[tie])
-            _state(spec, linkage, group, sweeps, notes)
+            drives = set() if sweeps is motors else {*driven, *passive}
+            _state(spec, linkage, group, sweeps, notes, _without_drives(spec, linkage.names(group), drives, notes))
+    _hold_spinning(spec, passive)
+
+
+def _led_by_fingers(
+    linkage: Linkage, group: Group, sweeps: Sweeps, driven: Collection[str], passive: Collection[str], notes: list[Note]
+) -> Sweeps:
+    """Sweeps by the joints of a finger, where rods on balls let several motors move each; else those that are given."""
+    own = linkage.names(group) - set(driven) - set(passive)
+    rules = [Rule.of(j, sweeps, linkage.model.qpos0) for j in group.joints if linkage.model.joint(j).name in own]
+    if not any(rule.also for rule in rules):
+        return sweeps
+    others = linkage.sweeps(group, own, passive)
+    leaders = [linkage.model.joint(j).name for j in others]
+    if not set(leaders) <= own or any(len(sweep) < 2 for sweep in others.values()):
+        return sweeps
+    motors = " and ".join(linkage.model.joint(j).name for j in sweeps)
+    told = f"is moved by {motors} together; grasps state its values, not theirs"
+    notes.extend(Note("warning", name, told) for name in leaders)
+    return others
+
+
+def _without_drives(spec: mujoco.MjSpec, group: Collection[str], drives: set[str], notes: list[Note]) -> set[str]:
+    """Delete, in place, a group's motors and rods that carry no finger; their joints' names. Several joints lead each."""
+    gone: set[str] = set()
+    for name in sorted(group):
+        if name in gone:  # with the body of another one
+            continue
+        body = spec.joint(name).parent
+        below = {other.name for other in (*body.joints, *body.find_all("joint"))}
+        if below <= drives:
+            inside = {body.name, *(other.name for other in body.find_all("body"))}
+            for pair in [pair for pair in spec.excludes if inside & {pair.bodyname1, pair.bodyname2}]:
+                spec.delete(pair)
+            notes.append(Note("info", body.name, "drives a finger together with others, and is left out"))
+            gone |= below
+            spec.delete(body)
+    return gone
+
+
+def _hold_spinning(spec: mujoco.MjSpec, passive: Collection[str]) -> None:
+    """Hold hinges of passive balls, in place, that no tie moves while it moves others of the same ball: a rod's own axis."""
+    led = {equality.name1 for equality in spec.equalities if is_linear(equality)}
+    balls = {name[:-2] for name in led if name in passive}
+    for name in (name for name in sorted(passive) if name not in led and name[:-2] in balls):
+        spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=name)
 
 
 def is_linear(equality: mujoco.MjsEquality) -> bool:
@@ -301,19 +445,28 @@ class Linkage:
                 found.append(Group(tuple(joints), ties))
         return found
 
-    def leaders(self, group: Group, driven: Collection[str]) -> list[int]:
-        """The joints of a group that lead: driven ones, then those that neither a tie nor a spring determines."""
+    def leaders(self, group: Group, driven: Collection[str], passive: Collection[str]) -> list[int]:
+        """The joints of a group that lead: driven ones, then others that neither a tie nor a spring determines."""
         jacobian = self.gaps(self.close(group, self._off_centre(), {}), group.ties)[1][:, list(group.joints)]
         following = {self.ties[tie].name1 for tie in group.ties}
         names = {j: self.model.joint(j).name for j in group.joints}
         moved = sorted((j for j in group.joints if names[j] in driven), key=lambda j: names[j] in following)
         sprung = any(self.springs[j] > 0 for j in group.joints)
-        found: list[int] = []
-        for joint in moved if moved and sprung else [*moved, *(j for j in group.joints if j not in moved)]:
+        others, found = [j for j in group.joints if j not in moved and names[j] not in passive], list[int]()
+        for joint in moved if moved and sprung else [*moved, *others]:
             held = np.array([[float(j == k) for j in group.joints] for k in [*found, joint]])
             if np.linalg.matrix_rank(np.vstack([jacobian, held]), 1e-4) == np.linalg.matrix_rank(jacobian, 1e-4) + len(held):
                 found.append(joint)
         return found
+
+    def names(self, group: Group) -> set[str]:
+        """Names of a group's joints."""
+        return {self.model.joint(j).name for j in group.joints}
+
+    def sweeps(self, group: Group, driven: Collection[str], passive: Collection[str]) -> Sweeps:
+        """Joint values while each leader of a group goes through its range, by leader."""
+        leaders = self.leaders(group, driven, passive)
+        return {leader: self.sweep(group, leaders, leader) for leader in leaders}
 
     def close(self, group: Group, q: Joints, held: Mapping[int, float]) -> Joints:
         """The joint values near some at which the loops of a group close and its springs rest, with some joints held."""
@@ -393,16 +546,17 @@ class Rule:
 
 
 def _state(
-    spec: mujoco.MjSpec, linkage: Linkage, group: Group, sweeps: Mapping[int, Float[np.ndarray, "k n"]], notes: list[Note]
+    spec: mujoco.MjSpec, linkage: Linkage, group: Group, sweeps: Mapping[int, Float[np.ndarray, "k n"]], notes: list[Note],
+    gone: Collection[str],
 ) -> None:
-    """Add the rules of a group, and let its joints' ranges be those in which they hold."""
+    """Add the rules of a group but for joints that are gone, and let its joints' ranges be those in which they hold."""
     names, reference = [linkage.model.joint(j).name for j in range(linkage.model.njnt)], linkage.model.qpos0
     for leader, sweep in sweeps.items():
         first, last = sweep[[0, -1], leader]
         if last - first < linkage.upper[leader] - linkage.lower[leader] - 1e-9:
             _limit(spec, names[leader], first, last)
             notes.append(Note("warning", names[leader], f"its ties hold from {first:.3g} to {last:.3g}; now its limits"))
-    for joint in (j for j in group.joints if j not in sweeps):
+    for joint in (j for j in group.joints if j not in sweeps and names[j] not in gone):
         rule = Rule.of(joint, sweeps, reference)
         tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=names[joint],
                                 name2=names[rule.leader] if rule.slope else "")

@@ -6,17 +6,23 @@ import copy
 import hashlib
 import math
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NoReturn
 from urllib.parse import unquote
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import reading
-from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer, open_mesh
 from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
+from dro_grasp.hands.description.inertials import mend_urdf_inertials
 from dro_grasp.hands.description.xml_files import DEEPEST
 
+CONTINUOUS = "but is continuous, a type without limits, so they are not used: if it has them, make it revolute"
+"""End of the note of a joint whose limits are not used."""
+NOT_FETCHED = "is a pointer of Git LFS"  # Why a mesh that is there has no shape
 MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one degree of freedom
 
 
@@ -29,13 +35,10 @@ def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, 
     _check_names(root, path)
     _settle_joints(root, path, notes)
     _drop_empty_shapes(root, path, notes)
+    mend_urdf_inertials(root, notes)
     base = _check_links(root, path)
     if base == "world":
-        for place, attribute in (("link", "name"), ("joint/parent", "link"), ("joint/child", "link")):
-            for element in root.findall(f"{place}[@{attribute}='world']"):
-                element.set(attribute, "world_link")
-        notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in "
-                          "exported files"))
+        _rename_world(root, path, notes)
     _check_mimic(root, notes)
     files, converted = resolve_meshes(root, path, notes)
     extension = root.find("mujoco")
@@ -47,6 +50,16 @@ def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, 
     compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
                            boundinertia=str(LEAST_INERTIA), strippath="false")
     return ET.tostring(root, encoding="unicode"), files, converted
+
+
+def _rename_world(root: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Rename, in place, a root link `world`, which is MuJoCo's name for the ground."""
+    below = [joint.find("child").get("link", "") for joint in root.findall("joint/parent[@link='world']/..")]  # type: ignore[union-attr]
+    for place, attribute in (("link", "name"), ("joint/parent", "link")):
+        for element in root.findall(f"{place}[@{attribute}='world']"):
+            element.set(attribute, "world_link")
+    notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in exported "
+                      f"files, and no robot has such a frame: for poses of link '{below[0]}' give {path.name}#{below[0]}"))
 
 
 def _check_names(root: ET.Element, path: Path) -> None:
@@ -75,6 +88,9 @@ def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
                                     "three numbers, not all zero")
             if kind != "continuous":
                 _check_limits(joint, path, notes)
+            elif (stated := joint.find("limit")) is not None and {"lower", "upper"} <= stated.attrib.keys():
+                told = f"states limits of {stated.get('lower')} to {stated.get('upper')}, {CONTINUOUS}"
+                notes.append(Note("warning", name, told))
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -94,6 +110,12 @@ def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
     if lower == upper and joint.find("mimic") is None:
         joint.set("type", "fixed")
         notes.append(Note("warning", joint.get("name", ""), "has both limits at zero and is taken as fixed"))
+
+
+def _has_no_range(joint: ET.Element) -> bool:
+    """Whether both limits of a joint that is taken as fixed are zero."""
+    limit = joint.find("limit")
+    return limit is not None and {"lower", "upper"} <= limit.attrib.keys()
 
 
 def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -134,8 +156,11 @@ def _check_links(root: ET.Element, path: Path) -> str:
         raise HandError(f"{path} has no <link>; expected a robot hand description. Expand a xacro file first: xacro {path} > "
                         "hand.urdf")
     if not moving:
-        raise HandError(f"{path} has no moving joint ({len(joints)} fixed); a hand needs at least one revolute or "
-                        "prismatic joint")
+        still = [joint.get("name", "") for joint in joints if _has_no_range(joint)]
+        raise HandError(f"{path} has no moving joint ({len(joints)} fixed); a hand needs at least one revolute or prismatic "
+                        "joint" + (f". Both limits of {len(still)} joints are zero ({', '.join(still[:3])}"
+                                   f"{', ...' if len(still) > 3 else ''}), so they cannot move: state their limits"
+                                   if still else ""))
     parent: dict[str, str] = {}
     for joint in joints:
         above, below = (_link_of(joint, end, links, path) for end in ("parent", "child"))
@@ -185,49 +210,69 @@ def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[lis
     no mesh can be found, and there is no other shape.
     """
     files: dict[str, Path] = {}
-    missing: list[str] = []
+    missing: dict[str, str] = {}
     for link in root.iter("link"):
-        lost = [element for element in [*link.findall("visual"), *link.findall("collision")]
-                if not _resolve_mesh(element, path.parent, files)]
-        for element in lost:
+        shapes = [*link.findall("visual"), *link.findall("collision")]
+        lost = {element: fault for element in shapes if (fault := _resolve_mesh(element, path, files, notes))}
+        for element, fault in lost.items():
             name = element.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
-            missing.append(name)
+            missing[name] = fault
             link.remove(element)
-            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is left out"))
+            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' {fault} and is left out"
+                              f"{f'; {FETCH}' if fault == NOT_FETCHED else ''}"))
         if any(element.tag == "collision" for element in lost) and link.find("collision") is None:
             _collide_with_visuals(link, notes)
     if missing and not files and root.find("link/*/geometry") is None:
-        looked = ", ".join(str(p) for p in _candidates(missing[0], path.parent)[:4])
-        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked for "
-                        f"{looked}); put the meshes beside the URDF or correct the file names")
+        _refuse_meshes(missing, path)
     converted = {name: file for name, file in files.items() if name != str(file)}
     return list(files.values()), converted
 
 
-def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> bool:
-    """Point a shape's mesh to its file, or to a name that stands in for it; False if there is no such file."""
+def _refuse_meshes(missing: dict[str, str], path: Path) -> NoReturn:
+    """Refuse a hand without any shape, whose meshes are missing for these reasons."""
+    first = next(iter(missing))
+    if NOT_FETCHED in missing.values():
+        raise HandError(f"{path}: none of its {len(missing)} meshes can be read: {list(missing.values()).count(NOT_FETCHED)} "
+                        f"{'are pointers' if len(missing) > 1 else 'is a pointer'} of Git LFS (first: '{first}'); {FETCH}")
+    looked = ", ".join(str(p) for p in _candidates(first, path.parent)[:4])
+    raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{first}'; looked for "
+                    f"{looked}); put the meshes beside the URDF or correct the file names")
+
+
+def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes: list[Note]) -> str:
+    """Point a shape's mesh to its file, or to a name that stands in for it; what is wrong if there is none, else nothing."""
     mesh = element.find("geometry/mesh")
     if mesh is None:
-        return True
+        return ""
     name = mesh.get("filename", "")
-    file = find_mesh(name, folder)
+    file = find_mesh(name, path.parent) or find_mesh(name, path.resolve().parent)
     if file is None:
-        return False
+        return "was not found"
+    if is_pointer(file):
+        return NOT_FETCHED
+    if not any(os.path.isfile(candidate) for candidate in _candidates(name, path.parent)):
+        told = Note("warning", name, f"was not found, and {file} is taken for it")
+        notes.extend([] if told in notes else [told])
     readable = file.suffix.lower() in {".stl", ".obj", ".msh"}  # by MuJoCo; trimesh converts the others
     stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
     mesh.set("filename", stand_in)
     files[stand_in] = file
-    return True
+    return ""
 
 
-def as_obj(file: Path) -> bytes:
-    """A mesh in any format trimesh reads, as OBJ text."""
+def as_obj(file: Path, notes: list[Note]) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text in metres; another unit that the file states is noted."""
     import trimesh
 
     # trimesh alone is called here, and its many readers raise whatever they stumble over.
     with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
         loaded = open_mesh(file)
+        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        if not math.isclose(unit, 1.0):
+            mesh.apply_scale(unit)
+            told = Note("info", file.name, f"states that its unit is {unit:g} m, and is taken so")
+            notes.extend([] if told in notes else [told])
         return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
 
 
@@ -243,6 +288,7 @@ def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
 
 def _candidates(name: str, folder: Path) -> list[Path]:
     """Paths at which a mesh may lie, the most likely first; in URIs, %20 may stand for a space."""
+    name = re.sub(r"^(?:file://)?\$\(find ([^)]*)\)", r"package://\1", name)  # what xacro would have replaced
     rest = name.replace("\\", "/").split("://", 1)[-1]
     roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
     tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
@@ -250,7 +296,30 @@ def _candidates(name: str, folder: Path) -> list[Path]:
 
 
 def find_mesh(name: str, folder: Path) -> Path | None:
-    """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none."""
+    """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none.
+
+    Where no file has the very name, one whose name differs in percent signs or in the case of letters is taken.
+    """
     if not name:
         return None
-    return next((file.resolve() for file in _candidates(name, folder) if os.path.isfile(file)), None)
+    likely = [*_candidates(name, folder), *_candidates(unquote(name), folder)]
+    found = next((file for file in likely if os.path.isfile(file)), None)
+    found = found or next(filter(None, map(in_any_case, likely)), None)
+    return None if found is None else found.resolve()
+
+
+def in_any_case(file: Path) -> Path | None:
+    """A file whose path differs in the case of letters alone; None if there is none."""
+    found = Path(file.anchor)
+    for part in file.parts[1:] if file.anchor else file.parts:
+        if part == ".." or os.path.lexists(found / part):
+            found /= part
+            continue
+        try:
+            alike = sorted(name for name in os.listdir(found) if name.casefold() == part.casefold())
+        except OSError:
+            return None
+        if not alike:
+            return None
+        found /= alike[0]
+    return found if os.path.isfile(found) else None

@@ -11,6 +11,7 @@ import defusedxml.ElementTree
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import command
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer
 
 DEEPEST = 100  # Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30
 MAX_ELEMENTS = 50_000  # Most elements of one file (ours)
@@ -20,6 +21,8 @@ MAX_PIXELS = 10_000  # Most pixels of a generated texture along each side (ours)
 MAX_DIVISIONS = 200.0  # Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB
 UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
+NAMES = {"name", "link", "joint", "filename", "file", "mesh", "material", "class"}
+"""Attributes in which words stand, where a hand is read even if a template left its expressions there (ours)."""
 
 
 def parse_xml(path: Path) -> ET.Element:
@@ -32,21 +35,39 @@ def parse_xml(path: Path) -> ET.Element:
     if path.stat().st_size > MAX_BYTES:
         raise HandError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; expected a robot hand of at most "
                         f"{MAX_BYTES / 1e6:.0f}")
+    if is_pointer(path):
+        raise HandError(f"{path} is a pointer of Git LFS, not the hand; {FETCH}")
     try:
         root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
     except defusedxml.DefusedXmlException as error:
         raise HandError(f"{path} declares XML entities ({type(error).__name__}), which are refused because they can "
                         "exhaust memory or read other files; remove its <!ENTITY ...> lines") from error
     except (ET.ParseError, UnicodeError) as error:
+        if "unbound prefix" in str(error) and b"<xacro:" in path.read_bytes():
+            raise HandError(f"{path} is a xacro template without xmlns:xacro; {_expanding(path)}") from error
         raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     except (OSError, ValueError, LookupError) as error:
         raise HandError(f"{path} cannot be read ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     assert root is not None  # an empty file is no XML
     _check_elements(root, path)
-    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()):
-        expanded = path.with_name("expanded.urdf")
-        raise HandError(f"{path} is a xacro template; expand it first: {command('xacro', path, '-o', expanded)}")
+    if any("xacro" in str(element.tag).rpartition("}")[0] for element in root.iter()):  # files spell its namespace in many ways
+        raise HandError(f"{path} is a xacro template; {_expanding(path)}")
+    _refuse_expressions(root, path)
     return root
+
+
+def _expanding(path: Path) -> str:
+    return f"expand it first: {command('xacro', path, '-o', path.with_name('expanded.urdf'))}"
+
+
+def _refuse_expressions(root: ET.Element, path: Path) -> None:
+    """Refuse expressions of a template where numbers stand; names may look like them, and so may what nobody reads."""
+    for part in root:
+        for element in part.iter() if part.tag in {"link", "joint", "group_state"} or root.tag == "mujoco" else ():
+            for attribute, value in element.attrib.items():
+                if "${" in value and attribute not in NAMES:
+                    raise HandError(f"{path}: <{element.tag}> of {part.tag} '{part.get('name', '')}' has "
+                                    f"{attribute}=\"{value[:60]}\", an expression of xacro; {_expanding(path)}")
 
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Shaped
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
@@ -16,11 +17,28 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, table_note
+from dro_grasp.objects.loading import (
+    check_scale,
+    check_view,
+    cloud_object,
+    dropped_note,
+    estimate_normals,
+    given_normals,
+    table_note,
+)
 from dro_grasp.objects.perception.completion import complete_cloud
-from dro_grasp.objects.reading import numbers, read_points
+from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
+SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
+"""Width over height of cameras' images [1] (ours)."""
+RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
+"""Widths of other images that a camera's matrix may be of, over that of the given one [1] (ours)."""
+DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
+"""Units of depth images [m], the largest first."""
+DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
+FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
 
@@ -37,10 +55,10 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     Raises:
         ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
-    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
-    if image.ndim != 2 or matrix.shape != (3, 3) or not abs(float(np.linalg.det(matrix))) > 0:
-        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), "
-                          "and a 3x3 matrix with focal lengths and principal point in pixels")
+    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
+    if image.ndim != 2:
+        raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
+    _check_intrinsics(matrix, *image.shape)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
@@ -51,12 +69,56 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    if float(np.median(image[valid])) > 10.0:  # [m] (ours)
-        raise ObjectError(f"the median depth is {np.median(image[valid]):g}, too far for metres; divide millimetres by 1000")
+    _check_depths(float(np.median(image[valid])))
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
-    rays = np.linalg.solve(matrix.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
+    rays = np.linalg.solve(matrix, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
+
+
+def _check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int) -> None:
+    """Refuse a matrix that is no pinhole camera's, or that of an image of another size, by an ObjectError."""
+    expected = (f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of {width} x {height}, with the "
+                f"principal point (cx, cy) near ({width / 2:g}, {height / 2:g})")
+    given = f"the intrinsics are {matrix.tolist()}"
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ObjectError(f"{given}; {expected}")
+    if (matrix[:2, 2] == 0).all() and (matrix[2, :2] != 0).any():
+        raise ObjectError(f"{given}, which is transposed: its third row holds the principal point; {expected}")
+    if not np.allclose(matrix[2], [0, 0, 1]) or abs(matrix[1, 0]) > 1e-6 * abs(matrix[1, 1]):
+        raise ObjectError(f"{given}, which is no pinhole matrix: its third row is not 0 0 1, or its second has no 0 first; "
+                          f"{expected}")
+    (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+    if min(fx, fy) <= 0:
+        raise ObjectError(f"{given}: its focal lengths are not positive; {expected}")
+    if max(fx, fy) < 10 and max(abs(cx), abs(cy)) <= 1.5:  # (ours) no lens sees so wide
+        raise ObjectError(f"{given}, which is divided by the size of the image: multiply its first row by {width} and its "
+                          f"second by {height}; {expected}")
+    _check_resolution(matrix, height, width, given, expected)
+
+
+def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int, given: str, expected: str) -> None:
+    # A part of an image has its principal point anywhere, and rarely the sides of a whole one.
+    if not any(abs(width / height / sides - 1) < 0.01 for sides in SIDES):
+        return
+    across, down = (2 * (float(c) + 0.5) / side for c, side in zip(matrix[:2, 2], (width, height), strict=True))
+    other = any(abs(across / factor - 1) < 0.08 for factor in RESOLUTIONS)
+    if other and down > 0 and any(abs(across / down / sides - 1) < 0.08 for sides in (1.0, 4 / 3, 3 / 4)):
+        raise ObjectError(f"{given}, which is of an image {across:.2g} times as wide and {down:.2g} times as high: divide its "
+                          f"first row by {across:.2g} and its second by {down:.2g}, or give the image that it belongs to; "
+                          f"{expected}")
+
+
+def _check_depths(median: float) -> None:
+    """Refuse depths whose median is too far for metres, by an ObjectError that names their likely unit."""
+    least, most = DEPTHS
+    if median <= most:
+        return
+    found = {unit: size for unit, size in DEPTH_UNITS.items() if least <= median * size <= most}
+    if not found:
+        raise ObjectError(f"the median depth is {median:g}, too far for any unit; give depths along z in metres")
+    told = " or ".join(f"{median * size:.3g} m in {unit} (divide by {1 / size:.0f})" for unit, size in found.items())
+    raise ObjectError(f"the median depth is {median:g}, too far for metres; it is {told}")
 
 
 def load_scan(
@@ -64,7 +126,9 @@ def load_scan(
 ) -> ObjectModel:
     """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
     check_scale(scale)
-    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
+    rows = read_rows(path)
+    rows[:, :3] *= scale
+    return scanned_object(path.stem, rows, T_frame_camera, keep_table=keep_table)
 
 
 @checked
@@ -78,7 +142,8 @@ def scanned_object(
 
     Args:
         name: What to call the object.
-        points: Points in the camera's frame, (n, 3) [m].
+        points: Points in the camera's frame, (n, 3) or (h, w, 3) [m]; NaN and (0, 0, 0) are dropped. With normals (n, 6), those
+            are used if they are unit vectors towards the camera.
         T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
             `table` are given; the camera's own frame by default.
         denoise: Drop outliers.
@@ -91,24 +156,11 @@ def scanned_object(
         OptionError: The pose is no rigid motion.
     """
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
-    kept = given_points(points, name)
-    kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
-    kept = kept[distinct_points(kept)]
-    total, table = len(kept), None if keep_table else table_plane(kept, camera)
-    if table is not None:
-        kept = kept[above_plane(kept, table)]
-    cut = total - len(kept)
-    if len(kept) > CLOUD_POINTS:
-        kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
-    if denoise and len(kept) > NEIGHBOURS:
-        kept = without_outliers(kept)
-    if len(kept) < NEIGHBOURS:
-        raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
-    check_extent(kept, name)
-    if float((kept @ kept.mean(0)).min()) <= 0:
-        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
-                          "camera's frame")
-    normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
+    clean = _cleaned(given_points(points, name), name, denoise, keep_table)
+    kept, table, camera = clean.rows[:, :3], clean.table, np.zeros(3)
+    normals, odd = facing_normals(clean.rows, name)
+    if normals is None:
+        normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
     if complete:
         up = None if T is None else T[2, :3]
@@ -119,15 +171,67 @@ def scanned_object(
         table = None if table is None else moved_plane(table, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
-    return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
+    cut_off = () if table is None else (table_note(table, clean.cut, clean.total),)
+    return replace(obj, table=table, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
 
 
-def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
-    """The points of a cloud, NaN included [m]; an ObjectError if they are none."""
-    array = numbers(points, origin).astype(np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
+class Cleaned(NamedTuple):
+    """What is the object's of a camera's points."""
+
+    rows: Float[np.ndarray, "n columns"]  # Points [m], and normals if there are any
+    table: Float[np.ndarray, "4"] | None  # The table that was cut off: its normal and its height [m]
+    cut: int  # Points that went with it
+    total: int  # Points before
+    notes: tuple[str, ...]  # What to say of the others
+
+
+def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, keep_table: bool) -> Cleaned:
+    """The points that are the object's; an ObjectError if they are none."""
+    there, camera = returned(rows[:, :3]), np.zeros(3)
+    told = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
+    rows = rows[there]
+    rows = rows[distinct_points(rows[:, :3])]
+    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
+    if table is not None:
+        rows = rows[above_plane(rows[:, :3], table)]
+    cut = total - len(rows)
+    if not keep_table:
+        own, apart = one_thing(rows[:, :3], table is not None, name)
+        rows, told = rows[own], (*told, *apart)
+    if len(rows) > CLOUD_POINTS:
+        rows = rows[np.random.default_rng(0).permutation(len(rows))[:CLOUD_POINTS]]
+    if denoise and len(rows) > NEIGHBOURS:
+        rows = rows[ordinary(rows[:, :3])]
+    if len(rows) < NEIGHBOURS:
+        raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
+    check_view(rows[:, :3], name)
+    if float((rows[:, :3] @ rows[:, :3].mean(0)).min()) <= 0:
+        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
+                          "camera's frame")
+    return Cleaned(rows, table, cut, total, told)
+
+
+def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n columns"]:
+    """The points of a cloud, NaN included [m], and normals if there are any; an ObjectError if they are none."""
+    array = in_rows(numbers(points, origin).astype(np.float64))
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points, or (n, 6) with normals")
     return array
+
+
+def facing_normals(
+    rows: Float[np.ndarray, "n columns"], origin: str
+) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
+    """Given normals, turned to the camera at the origin; None to estimate them. And what to say."""
+    normals, odd = given_normals(rows[:, :3], rows[:, 3:], origin, named=True)
+    if normals is None:
+        return None, odd
+    facing = float(((rows[:, :3] * normals).sum(1) < 0).mean())
+    if max(facing, 1 - facing) < FACING:
+        return None, ("its normals do not all face the camera, so they were not used",)
+    if facing < 0.5:
+        return -normals, ("its normals pointed away from the camera and were turned",)
+    return normals, odd
 
 
 def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
@@ -139,6 +243,11 @@ def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
+    """The points that are no outliers."""
+    return points[ordinary(points)]
+
+
+def ordinary(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Points whose mean distance to their neighbours is not unusually large. Source: Rusu et al. 2008."""
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
-    return points[distance <= distance.mean() + 2.5 * distance.std()]  # (ours)
+    return distance <= distance.mean() + 2.5 * distance.std()  # (ours)

@@ -102,7 +102,7 @@ class FileSource(Source):
         if not parts:
             held = ", ".join(sorted(set(self.grasps.object))[:5])
             raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with "
-                                 "--objects")
+                                 "objects=...")
         return GraspBatch.concatenate(parts)
 
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:

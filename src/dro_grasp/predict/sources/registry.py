@@ -73,7 +73,7 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
         return _as_source(name, _made(name, SOURCES[name]))
     if name in WITH_DATA:
         if means is None:
-            raise OptionError(f"{name} needs training grasps; give a bundle (--bundle PATH)")
+            raise OptionError(f"{name} needs training grasps; give a bundle (bundle=PATH)")
         return MeanGraspSource(means, chosen=name.endswith("chosen"))
     if name.endswith(".parquet") or Path(name).is_dir():
         return FileSource(Path(name))

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import HandError, OptionError
-from dro_grasp.hands.check import HandReport, check_hand, hand_side
+from dro_grasp.hands.check import HandReport, check_hand, seen_side
 from dro_grasp.hands.description.loader import self_penetration
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.opening import FingerMotion
@@ -117,7 +117,7 @@ def _misread(plan: HandPlan, hand: Hand) -> str:
         return "another palm direction was derived"
     if plan.thumb != "none" and hand.thumb not in (None, len(plan.fingers) - 1):
         return "another finger was taken for the thumb"
-    if plan.side != "none" and hand_side(hand) not in ("none", plan.side):
+    if plan.side != "none" and seen_side(hand) not in (None, plan.side):
         return "the other side was derived"
     bending = plan.bending_joints()
     if any(sign > 0 and name in bending for name, sign in zip(hand.tree.joint_names, hand.opening_signs, strict=True)):

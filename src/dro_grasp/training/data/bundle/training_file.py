@@ -137,7 +137,7 @@ def write_bundle(
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
-                          "fewer objects or fewer grasps a pair (--per-pair)")
+                          "fewer objects or fewer grasps a pair (per_pair=...)")
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={HEADER: json.dumps(header)})
     return load_bundle(path)

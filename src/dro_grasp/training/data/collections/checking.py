@@ -58,7 +58,7 @@ def stored_protocol(pairs: Iterable[PairGrasps]) -> str:
     labels = sorted({label for pair in pairs for label in pair.grasps.protocol if label})
     known = {rules.label: name for name, rules in PROTOCOLS.items()}
     if len(labels) > 1 or not set(labels) <= set(known):
-        raise OptionError(f"the data set states outcomes under {', '.join(labels)}; say which protocol to check: --protocol")
+        raise OptionError(f"the data set states outcomes under {', '.join(labels)}; say which protocol to check: protocol=...")
     return known[labels[0]] if labels else DEFAULT_PROTOCOL
 
 

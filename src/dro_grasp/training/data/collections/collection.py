@@ -82,7 +82,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
         empty = False
         yield replace(pair, grasps=pair.grasps[pair.grasps.trial_success]) if only_successful else pair
     if empty:
-        raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without --only-successful")
+        raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without only_successful=True")
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:

@@ -63,7 +63,7 @@ class FilterConfig(Checked):
         if not self.protocols:
             raise OptionError("no protocol is given; name one at least that grasps must pass")
         if self.again and not self.resettle:
-            raise OptionError("grasps that fail are made again by settling them; ask for that too (--resettle)")
+            raise OptionError("grasps that fail are made again by settling them; ask for that too (resettle=True)")
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -182,7 +182,7 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
 
 def in_order(joints: Joints, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
     """Values of the independent joints, of the names of these and of all that move, followers included."""
-    give = "give the description that the data was made with (--hands)"
+    give = "give the description that the data was made with (hands=...)"
     if isinstance(joints, dict):
         # Names of MuJoCo's Shadow hand begin with the robot's.
         values = {**joints, **{name.rpartition(":")[2]: value for name, value in joints.items()}}
@@ -214,9 +214,9 @@ def import_grasps(
         for grasp in read_foreign(path, kind):
             hand = hands.get(grasp.hand, hands.get("") or grasp.hand)
             if not hand:
-                raise OptionError(f"{path} does not name its hand; name it with --hands")
+                raise OptionError(f"{path} does not name its hand; name it with hands=...")
             if not (obj or grasp.object):
-                raise OptionError(f"{path} does not name its object; name it with --object")
+                raise OptionError(f"{path} does not name its object; name it with object=...")
             groups.setdefault((hand, obj or grasp.object, grasp.scale), []).append(grasp)
     batches: dict[str, list[GraspBatch]] = {}
     missing: dict[str, str] = {}

@@ -88,7 +88,7 @@ def merge(
 def require_choice(per_pair: int | None) -> None:
     """Refuse a number of grasps of a pair with which none would be left."""
     if per_pair is not None and per_pair < 1:
-        raise OptionError(f"per_pair is {per_pair}; give at least 1, or leave it out to keep all grasps (--per-pair)")
+        raise OptionError(f"per_pair is {per_pair}; give at least 1, or leave it out to keep all grasps (per_pair=...)")
 
 
 def file_name(hand: str, number: int = 1) -> str:

@@ -9,16 +9,19 @@ from __future__ import annotations
 import multiprocessing
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import connection
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pebble import ProcessExpired, ProcessPool
 
-from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.errors import ClusterError, DroGraspError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.training.data.engine.threads import use_one_thread
 from dro_grasp.training.data.engine.worker import FinishedShard, Job, Task, make_shard
@@ -133,8 +136,8 @@ class LocalPool:
         return task, result
 
 
-def _one_process() -> ProcessPool:
-    return ProcessPool(1, initializer=use_one_thread, context=multiprocessing.get_context("spawn"))
+def _one_process(begin: Callable[[], None] = use_one_thread) -> ProcessPool:
+    return ProcessPool(1, initializer=begin, context=multiprocessing.get_context("spawn"))
 
 
 def _end(pool: ProcessPool) -> None:
@@ -150,12 +153,17 @@ def _replaced(pool: ProcessPool) -> ProcessPool:
 CONNECT_TIME = 5.0  # Longest wait for a cluster's head to accept a connection [s]. Ours
 GPU_SHARE = 0.25
 """Share of a GPU for a shard whose energies are computed there. Ours: trials, on the CPU, take most of its time."""
+SLICE = 1.0  # Longest time for which the process that joined a cluster cannot be told to leave it [s]. Ours
 RETRIES = 3
 """Times that Ray starts a shard again elsewhere when its process or node is gone. Ours; a shard depends on its seed alone."""
 
 
 class RayPool:
-    """Tasks of a Ray cluster, one CPU each."""
+    """Tasks of a Ray cluster, one CPU each.
+
+    A process of its own joins the cluster: Ray ends the process that joined, without a word, when the node of its machine
+    dies. A cluster that this process has joined already is used from here.
+    """
 
     def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
         """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
@@ -166,11 +174,71 @@ class RayPool:
         require_extra("ray")
         import ray
 
-        self.limit, self.started_here = limit, False
-        if not ray.is_initialized():
-            self.started_here = True
-            _connect(address or os.environ.get("RAY_ADDRESS"), workers)
-        self.ray, self.work = ray, work
+        self.process = None if ray.is_initialized() else _one_process(_join_alone)
+        try:
+            self._ask(_join, job, workers, limit, address or os.environ.get("RAY_ADDRESS"), work)
+        except BaseException as error:
+            self._end()
+            if isinstance(error.__cause__, BrokenProcessPool):
+                raise ClusterError("the process that joins the Ray cluster ended as it began; give it a script that can be "
+                                   'imported, with its calls under `if __name__ == "__main__":`') from error
+            raise
+
+    @property
+    def free(self) -> int:
+        """CPUs of the cluster now, less the shards in flight; at least one shard may wait for a node."""
+        return self._ask(_free)
+
+    def submit(self, task: Task) -> None:
+        """Hand a shard to the cluster."""
+        self._ask(_submit, task)
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        """Finished shards, errors, and shards whose machine is gone for good or that took too long.
+
+        Raises:
+            ClusterError: The node of this machine died.
+        """
+        end = time.monotonic() + timeout
+        while not (outcomes := self._ask(_wait, min(timeout, SLICE))) and time.monotonic() < end:
+            pass
+        return outcomes
+
+    def close(self) -> None:
+        """Cancel what runs, and leave the cluster if this pool joined it."""
+        with suppress(ClusterError):  # it has been said
+            self._ask(_leave)
+        self._end()
+
+    def _ask(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """What a call returns in the process that joined the cluster."""
+        if self.process is None:
+            return call(*arguments)
+        try:
+            return self.process.schedule(call, arguments).result()
+        except (ProcessExpired, BrokenProcessPool, RuntimeError) as error:
+            raise ClusterError("the Ray node of this machine died, and this run with it; the shards that are there are whole. "
+                               "Start the node again (`ray start`) or name another head, and run the same command again: it "
+                               "goes on from them") from error
+
+    def _end(self) -> None:
+        if self.process is not None:
+            _end(self.process)
+
+
+class RayTasks:
+    """Shards that a Ray cluster makes, in the process that joined it."""
+
+    joined: RayTasks | None = None  # Those of this process
+
+    def __init__(self, job: Job, workers: int, limit: float, address: str | None, work: Work) -> None:
+        """Join the cluster, unless this process has; arguments are those of `RayPool`."""
+        import ray
+
+        self.limit, self.ray, self.work = limit, ray, work
+        self.joined_here = not ray.is_initialized()
+        if self.joined_here:
+            _connect(address, workers)
         self.job = ray.put(job)
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
         if job.config.synthesis.device != "cpu":
@@ -179,31 +247,20 @@ class RayPool:
         self.start = ray.remote(**options)(attempt)
         self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
 
-    @property
-    def free(self) -> int:
-        """CPUs of the cluster now, less the shards in flight; at least one shard may wait for a node."""
-        cpus = max(1, int(self.ray.cluster_resources().get("CPU", 0)))
-        return max(0, cpus - len(self.running))
-
-    def submit(self, task: Task) -> None:
-        """Hand a shard to the cluster."""
-        self.running[self.start.remote(self.work, self.job, task)] = (task, time.monotonic())
+    @staticmethod
+    def here() -> RayTasks:
+        """Those of this process."""
+        assert RayTasks.joined is not None
+        return RayTasks.joined
 
     def wait(self, timeout: float) -> list[Outcome]:
-        """Finished shards, errors, and shards whose machine is gone for good or that took too long."""
+        """As `RayPool.wait`."""
         done, _ = self.ray.wait(list(self.running), num_returns=1, timeout=timeout)
         outcomes = [self._collect(ref) for ref in done]
         for ref in [r for r, (_, since) in self.running.items() if time.monotonic() - since > self.limit]:
             self.ray.cancel(ref, force=True)
             outcomes.append((self.running.pop(ref)[0], Failed(f"took longer than {self.limit:.0f} s", died=True)))
         return outcomes
-
-    def close(self) -> None:
-        """Cancel what runs, and leave the cluster if this pool joined it."""
-        for ref in self.running:
-            self.ray.cancel(ref, force=True)
-        if self.started_here:
-            self.ray.shutdown()
 
     def _collect(self, ref: ray.ObjectRef) -> Outcome:
         task = self.running.pop(ref)[0]
@@ -213,19 +270,65 @@ class RayPool:
             return task, Failed(f"its Ray worker was lost ({type(error).__name__})", died=True)
 
 
+def _join_alone() -> None:
+    """Prepare the process that joins a cluster: what Ray prints is no result, and it ends with the one that started it."""
+    use_one_thread()
+    os.dup2(2, 1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+def _join(*arguments: Any) -> None:
+    RayTasks.joined = RayTasks(*arguments)
+
+
+def _free() -> int:
+    tasks = RayTasks.here()
+    return max(0, max(1, int(tasks.ray.cluster_resources().get("CPU", 0))) - len(tasks.running))
+
+
+def _submit(task: Task) -> None:
+    tasks = RayTasks.here()
+    tasks.running[tasks.start.remote(tasks.work, tasks.job, task)] = (task, time.monotonic())
+
+
+def _wait(timeout: float) -> list[Outcome]:
+    return RayTasks.here().wait(timeout)
+
+
+def _leave() -> None:
+    if (tasks := RayTasks.joined) is None:
+        return
+    for ref in tasks.running:
+        tasks.ray.cancel(ref, force=True)
+    if tasks.joined_here:
+        tasks.ray.shutdown()
+
+
 def _connect(address: str | None, workers: int) -> None:
     import ray
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
-        ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        try:
+            ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        except Exception as error:  # Ray raises that very class
+            raise ClusterError(f"Ray could not start a node on this machine ({str(error).partition('.')[0]}); try again when "
+                               "it is less busy, or use engine='local'") from error
         return
     try:
         _knock(address)
         ray.init(address=address, **quiet)
     except (OSError, RuntimeError, ValueError) as error:
-        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
-                          "give the address that it prints") from error
+        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, "
+                          "give the address that it prints and, where Ray asks for one, the head's token "
+                          "(RAY_AUTH_TOKEN)") from error
 
 
 def _knock(address: str) -> None:

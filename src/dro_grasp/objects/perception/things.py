@@ -1,0 +1,45 @@
+"""Whether a cloud is one thing: several that stand apart are a scene, of which one has to be chosen."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.point_groups import separate_groups
+
+MOST_TOLD = 6  # Things that a message lists (ours)
+
+
+def one_thing(
+    points: Float[np.ndarray, "n 3"], on_table: bool, origin: str
+) -> tuple[Int[np.ndarray, " _"], tuple[str, ...]]:
+    """The points of the one thing of a cloud [m], and what to say of it.
+
+    Of what stood on a table, scattered points are left out. Without one, all points stay.
+
+    Raises:
+        ObjectError: Several things stand on the table.
+    """
+    every = np.arange(len(points))
+    things = separate_groups(points) if len(points) else []
+    if len(things) > 1:
+        told = "; ".join(f"{_cm(points[own])} cm about {_m(points[own])} m" for own in things[:MOST_TOLD])
+        said = f"{len(things)} things that stand apart ({told}{'; ...' if len(things) > MOST_TOLD else ''})"
+        if on_table:
+            raise ObjectError(
+                f"{origin} is a view of a table with {said}; cut out the one that is meant, for example the points within "
+                "10 cm of its middle, or keep all points as one object with keep_table=True")
+        return every, (f"it is {said}, and all of them count as one object; of a view of a scene, cut out the one that is "
+                       "meant",)
+    if not on_table or not things or len(things[0]) == len(points):
+        return every, ()
+    return np.sort(things[0]), (f"{len(points) - len(things[0])} scattered points beside it were left out",)
+
+
+def _cm(points: Float[np.ndarray, "n 3"]) -> str:
+    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0))
+
+
+def _m(points: Float[np.ndarray, "n 3"]) -> str:
+    return " ".join(f"{value + 0.0:.2f}" for value in (points.min(0) + points.max(0)) / 2)
