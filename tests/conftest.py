@@ -103,7 +103,9 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     from dro_grasp.arm.robot import BUILTIN_ROBOTS
 
     values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
-    values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
+    # This hand's palm faces along the flange, LEAP's across it.
+    mount = {"link": "link7", "position": [0.0, 0.0, 0.03], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3", "mount": mount}
     del values["camera"]
     path: Path = tmp_path_factory.mktemp("robot") / "small.yaml"
     path.write_text(yaml.safe_dump(values))

@@ -349,7 +349,7 @@ def lowest_above(robot: dro.Robot, made: MotionPlan, centre: np.ndarray, half: f
 
 @pytest.mark.slow
 @pytest.mark.parametrize("named", ["xarm7_leaphand", "ur5e_allegro", "small"])
-@pytest.mark.parametrize(("name", "turn", "height"), [("can", 0.0, 0.0), ("can", np.pi / 2, 0.0), ("can", 0.0, 0.12)])
+@pytest.mark.parametrize(("name", "turn", "height"), [("can", 0.0, 0.0), ("can", np.pi / 2, 0.0), ("mug", 0.0, 0.12)])
 @pytest.mark.parametrize("stated", [True, False], ids=["table", "no table"])
 def test_no_plan_passes_what_the_object_stands_on(
     named: str, name: str, turn: float, height: float, stated: bool, small_robot: str

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import dro_grasp as dro
+from dro_grasp.hands.build import HandBuilder
 from dro_grasp.hands.check import HandReport, check_hand, picture
 from dro_grasp.hands.confidence import LOW
+from dro_grasp.hands.library import load_hand_description
 from tests.helpers.claw_urdf import written
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.strange_hands import QUARTER, block, finger, fixed, human, jaws, ring, robot, sliding, thumb_hinges, tripod
@@ -161,6 +165,28 @@ def test_straight_is_where_a_finger_reaches_farthest_not_where_joints_are_zero(t
     assert report.facts["palm_direction"] == pytest.approx([1, 0, 0], abs=0.3)
 
 
+@pytest.mark.parametrize("off", [-0.012, 0.012])
+def test_where_the_axis_of_a_spreading_joint_lies_bends_no_straight_finger(tmp_path: Path, off: float) -> None:
+    """The frame of the joint that spreads a finger lies before or behind the hinges; the finger reaches no farther bent."""
+    names, text = ("index", "middle", "ring", "little"), human(spread=(-0.35, 0.35))
+    for name in names:
+        place = text.split(f'<child link="{name}1"/><origin xyz="')[1].split('"')[0]
+        text = text.replace(f'<child link="{name}1"/><origin xyz="{place}"/>',
+                            f'<child link="{name}1"/><origin xyz="{off} {place.split(" ", 1)[1]}"/>')
+        text = text.replace(f'<child link="{name}2"/><origin xyz="0 0 0.012"/>',
+                            f'<child link="{name}2"/><origin xyz="{-off} 0 0.012"/>')
+    for end in ("mcp", "pip"):
+        for name in names:
+            before, after = text.split(f'<joint name="{name}_{end}"')
+            text = f'{before}<joint name="{name}_{end}"' + after.replace('upper="1.57"', 'upper="0.6"', 1)
+    report = checked(tmp_path, text)
+    assert report.facts["palm_direction"] == pytest.approx([1, 0, 0], abs=0.3)
+    assert [report.facts["open_posture"][f"{name}_mcp"] for name in names] == pytest.approx([0.0] * 4, abs=1e-3)
+    finder = HandBuilder(load_hand_description(tmp_path / "hand.urdf")[0]).finder
+    straight = dict(zip(finder.tree.joint_names, finder.straight.tolist(), strict=True))
+    assert [straight[f"{name}_{end}"] for name in names for end in ("mcp", "pip")] == pytest.approx([0.0] * 8, abs=0.1)
+
+
 FLAT = robot(block("palm", "0.02 0.09 0.08"), *(finger(f"f{i}_", f"0 {0.03 * (i - 1)} 0.04", [
     (f"f{i}_a", "0 1 0", -1.5, 1.5, 0.045), (f"f{i}_b", "0 1 0", -1.5, 1.5, 0.04)]) for i in range(3)))
 
@@ -180,6 +206,25 @@ def test_a_flat_hand_is_doubtful_until_it_is_stated_how_it_closes(tmp_path: Path
     assert not doubts(stated)
 
 
+@pytest.mark.parametrize("angle", [2.2, 2.36, 2.5])
+def test_the_palm_of_a_flat_hand_faces_where_fingers_bend_whatever_a_thumb_does(tmp_path: Path, angle: float) -> None:
+    """A plate out of the palm and the thumb beside it surround a ball, beside the row of fingers; all hinges bend both ways."""
+    def hinges(name: str, first: str, axis: str) -> list[tuple[str, str, float, float, float]]:
+        lengths = (0.028, 0.05, 0.06)
+        return [(f"{name}_{i}", axis if i else first, -QUARTER, QUARTER, length) for i, length in enumerate(lengths)]
+
+    row = [finger(f"f{i}_", f'0 {0.035 * i:.3f} {0.09 - 0.025 * i:.3f}" rpy="-0.3 0 0', hinges(f"f{i}", "1 0 0", "0 1 0"))
+           for i in range(3)]
+    thumb = finger("t_", '0.05 -0.06 -0.01" rpy="0 1.5708 0',
+                   hinges("t", "0 0 1", f"{math.cos(angle):.4f} {math.sin(angle):.4f} 0"))
+    plate = block("plate", "0.09 0.02 0.09") + fixed("plate", "0.05 -0.02 -0.03")
+    report = checked(tmp_path, robot(block("palm", "0.026 0.11 0.09", "0 0.02 0"), *row, thumb, plate))
+    assert report.facts["palm_direction"] == pytest.approx([0.95, 0, 0.3], abs=0.15)
+    assert (report.facts["thumb"], report.facts["side"]) == ("t_3", "left")
+    assert signs(report, "f0_1", "f1_1", "f2_1", "f0_2", "f1_2", "f2_2") == [-1] * 6
+    assert any("guess" in text for text in doubts(report))
+
+
 def test_a_keyframe_of_an_mjcf_may_state_how_it_closes(tmp_path: Path) -> None:
     one = ("<body name='{0}' pos='{1} 0 .01'><joint name='{0}' axis='0 1 0' range='-1.4 1.4'/>"
            "<geom type='box' size='.006 .006 .03' pos='0 0 .03'/></body>")
@@ -193,13 +238,20 @@ def test_a_keyframe_of_an_mjcf_may_state_how_it_closes(tmp_path: Path) -> None:
 def test_the_picture_tells_of_a_doubt(tmp_path: Path) -> None:
     from PIL import Image
 
-    def red_words(report: HandReport) -> bool:
+    def words(report: HandReport) -> tuple[np.ndarray, np.ndarray]:
+        """Where red words are, and all others, above and below what is drawn."""
         picture(report.hand, tmp_path / "hand.png")
         with Image.open(tmp_path / "hand.png") as sheet:
-            return (200, 20, 20) in {colour for _, colour in sheet.crop((0, 0, sheet.width, 30)).getcolors(1 << 24) or ()}
+            pixels = np.array(sheet).astype(int)
+        pixels[30:-30] = 255
+        red = pixels[..., 0] > pixels[..., 1] + 20
+        return np.argwhere(red), np.argwhere(~red & (pixels.sum(-1) < 600))
 
-    assert red_words(checked(tmp_path, FLAT))
-    assert not red_words(checked(tmp_path, human(), "sure.urdf"))
+    red, black = words(checked(tmp_path, FLAT, f"{'a_hand_of_a_long_name' * 2}.urdf"))
+    beside = black[(black[:, 0] >= red[:, 0].min()) & (black[:, 0] <= red[:, 0].max())]
+    assert len(beside)
+    assert beside[:, 1].max() + 10 < red[:, 1].min(), "words lie on one another"
+    assert not len(words(checked(tmp_path, human(), "sure.urdf"))[0])
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "gripper3", "leaphand", "shadowhand"])
@@ -207,3 +259,47 @@ def test_hands_that_are_read_right_are_not_doubted(name: str) -> None:
     report = check_hand(name)
     assert min(report.facts["confidence"].values()) > LOW
     assert torch.equal(report.hand.open_ends, loaded_hand(name).open_ends)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_fingers_of_one_joint_close_where_they_meet_the_thumb(tmp_path: Path, way: int) -> None:
+    """Three fingers of a hinge each follow one joint, which bends them to one side only; the index bends both ways."""
+    follows = [(name, 0, 1.4, '<mimic joint="middle"/>') for name in ("ring", "little")]
+    hinge = [("index", -1.4, 1.4, ""), ("middle", 0, 1.4, ""), *follows]
+    fingers = [finger(name, f"0 {0.033 - 0.022 * i} 0.05", [(name, f"0 {way} 0", lower, upper, 0.08)], mimic=mimic)
+               for i, (name, lower, upper, mimic) in enumerate(hinge)]
+    thumb = finger("thumb", f'{way * 0.02} 0.05 -0.02" rpy="-0.3 {way * 0.9} 0', [("thumb", f"0 {-way} 0", 0, 1.1, 0.06)])
+    report = checked(tmp_path, robot(block("palm", "0.025 0.09 0.1"), *fingers, thumb))
+    assert report.facts["palm_direction"] == pytest.approx([way, 0, 0], abs=0.4)
+    assert signs(report, "index", "middle") == [-1, -1]
+    assert report.facts["confidence"]["palm"] > LOW
+    assert not doubts(report)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_whole_finger_that_one_joint_bends_back_shows_where_the_palm_is_when_straight(tmp_path: Path, side: int) -> None:
+    """Each finger's joint, which drives both hinges, is straight at -0.6, its limit; at zero it is bent already."""
+    text = human(side=side)
+    for name in ("index", "middle", "ring", "little"):
+        text = text.replace(f'<child link="{name}1"/><origin', f'<child link="{name}1"/><ORIGIN', 1)
+        place = text.split('<ORIGIN xyz="')[1].split('"')[0]
+        text = text.replace(f'<ORIGIN xyz="{place}"/>', f'<origin xyz="{place}" rpy="0 0.6 0"/>')
+        text = text.replace(f'<child link="{name}2"/><origin xyz="0 0 0.045"/>',
+                            f'<child link="{name}2"/><origin xyz="0 0 0.045" rpy="0 0.9 0"/>'
+                            f'<mimic joint="{name}_mcp" multiplier="1.5"/>')
+        before, after = text.split(f'<joint name="{name}_mcp"')
+        text = f'{before}<joint name="{name}_mcp"' + after.replace('lower="-0.0"', 'lower="-0.6"', 1).replace(
+            'upper="1.57"', 'upper="0.9"', 1).replace('lower="-0.0"', 'lower="-0.9"', 1)
+    report = checked(tmp_path, text)
+    assert report.facts["palm_direction"] == pytest.approx([1, 0, 0], abs=0.3)
+    assert report.facts["side"] == SIDES[side]
+
+
+@pytest.mark.parametrize(("farthest", "told"), [(1.2, False), (2.4, True)])
+def test_a_thumb_that_opens_to_the_wrist_is_told(tmp_path: Path, farthest: float, told: bool) -> None:
+    """It swings about an axis across the palm, from the fingers' direction over the palm's to the wrist's."""
+    hinges = [("thumb_swing", "0 1 0", 0.4, farthest, 0.04), ("thumb_ip", "0 -1 0", 0.0, 1.0, 0.03)]
+    text = human(hinges).replace('rpy="-0.9 0 0"', 'rpy="0 0 0"')
+    report = checked(tmp_path, text)
+    assert report.facts["open_posture"]["thumb_swing"] == pytest.approx(farthest, abs=0.01)
+    assert [subject.subject for subject in report.notes if "towards the wrist" in subject.text] == ["thumb2"] * told

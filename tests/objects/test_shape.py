@@ -112,6 +112,26 @@ def test_grid_of_a_large_object_stays_small(monkeypatch: pytest.MonkeyPatch):
     assert baked["spacing"] > surface_distances.GRID_SPACING
 
 
+def test_few_points_are_computed_of_a_surface_that_fills_its_box(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(surface_distances, "EXACT_GRID", 20_000)
+    monkeypatch.setattr(surface_distances, "MOST_EXACT", 150_000)
+    corners = np.random.default_rng(0).uniform(-0.15, 0.15, (300, 3))
+    asked: list[int] = []
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        asked.append(len(points))
+        return surface_distances.signed_distances(corners, np.arange(300).reshape(-1, 3), points)
+
+    baked = surface_distances.bake_grid(corners, distance)
+    assert asked[-1] <= 150_000
+    assert sum(asked) < 400_000, "to find out how wide it must be, too"
+    assert surface_distances.GRID_SPACING < baked["spacing"] < 3 * surface_distances.GRID_SPACING
+    at = baked["origin"] + baked["spacing"] * np.indices(baked["values"].shape).reshape(3, -1).T
+    exact = distance(at)
+    near = np.abs(exact) < surface_distances.NEAR
+    np.testing.assert_allclose(baked["values"].ravel()[near], exact[near], atol=1e-6)
+
+
 def test_grid_is_read_from_the_cache_and_damage_is_mended(cache: Path, monkeypatch: pytest.MonkeyPatch):
     first = ball(0.01, 1).distance_field
     (file,) = cache.iterdir()

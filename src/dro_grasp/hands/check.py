@@ -248,8 +248,8 @@ def picture(hand: Hand, path: Path | str) -> None:
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)
-    if doubts := _doubts(hand):
-        pen.text((width + 220, 6), f"low confidence: {doubts}", fill=DOUBT, font=font)
+    if doubts := _doubts(hand):  # to the right of the legend
+        pen.text((2 * width - 12, height + line + 6), f"low confidence: {doubts}", fill=DOUBT, font=font, anchor="ra")
     with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 

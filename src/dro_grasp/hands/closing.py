@@ -28,7 +28,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import FEWEST_WITH_THUMB, PALM, Finger, JointMask, Joints, Point, axes_along, closing_gains
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
-from dro_grasp.hands.opening import BOTH_WAYS, FAR_BACK, ONE_WAY, Curl, FingerMotion, Line
+from dro_grasp.hands.opening import BOTH_WAYS, EXACT, FAR_BACK, ONE_WAY, Curl, FingerMotion, Line
 
 if TYPE_CHECKING:
     from dro_grasp.hands.build import LinkSurface
@@ -188,7 +188,6 @@ FACING = 0.8
 """Cosine to the direction in which fingers begin to close from which on a palm faces it (ours). Of 16 hands: 0.86 to 1."""
 TOGETHER = 0.6  # Length of the mean direction in which fingers close from which on they close alike (ours)
 LEVEL_FINGERS = 3  # Fewest fingers that show so where the palm faces (ours)
-EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
 CLOSED_SHARE = 0.25  # Share of its range next to its closed end in which no knuckle is open (ours)
 DECIDES = 0.3
 """Share of a finger's part in how much nearer fingertips come to each other from which on it tells where it closes (ours)."""
@@ -238,7 +237,7 @@ class ClosingFinder:
         other = dataclasses.replace(self, sideways=self.spreading(found).sideways & of_folded)
         abduction = (found.abduction | other.sideways) & self.movable
         cut = of_folded & other.bending(abduction)
-        straight = torch.where(cut, self.straight, self.start)
+        straight = torch.where(cut, self.outstretched, self.start)
         knuckles, opening = self.motion.knuckle_joints(cut), found.opening_signs
         room = CLOSED_SHARE * (tree.upper - tree.lower)  # a finger that lies across the palm is not open
         half = dataclasses.replace(tree, lower=torch.where(opening > 0, tree.lower + room, tree.lower),
@@ -258,7 +257,10 @@ class ClosingFinder:
         These are flat hands of which every last joint, but for a thumb's, bends as far back as forth.
         """
         other = self.spreading(found)
-        straight = self.motion.straightest((self.tree.lower + self.tree.upper) / 2, other.bending(found.abduction))
+        bends = other.bending(found.abduction)
+        # No posture of a finger of one joint is straighter than another: its zero is all there is to go by.
+        alone = (self.tree.moves[self.motion.links] & bends)[self.of_one_joint(bends)].any(0)
+        straight = self.motion.straightest(torch.where(alone, self.start, (self.tree.lower + self.tree.upper) / 2), bends)
         last = [int(joints.nonzero()[-1, 0]) for finger in self.fingers
                 if bool((joints := self.tree.moves[finger.tip] & self.movable).any())]
         enough = len(last) - (len(last) >= FEWEST_WITH_THUMB)
@@ -268,7 +270,7 @@ class ClosingFinder:
         signs, palm = other.better_side(straight)
         abduction = other.out_of_palm(straight, signs, palm) & self.movable
         closing = other.straight_about(Closing(signs, straight, abduction, palm), everywhere=True)
-        if closing is None or float(_tensor(closing.palm.direction) @ _tensor(palm.direction)) > AHEAD:
+        if closing is None or float(_tensor(closing.palm.direction) @ _tensor(palm.direction)) > FACING:
             return closing
         return dataclasses.replace(closing, palm=palm)  # its thumb, which opens otherwise now, would turn it
 
@@ -337,10 +339,13 @@ class ClosingFinder:
             with contextlib.suppress(HandError):
                 palm = self.examine(spread, signs, still)
                 ahead = float(_tensor(palm.direction) @ side) > AHEAD
-                sides.append((ahead, palm.score + self.lean(side), signs, palm))
+                sides.append((ahead, palm.score + self.lean(side), side, signs, palm))
         if not sides:
             raise HandError(NOTHING_ENCLOSED)
-        return max(sides, key=lambda found: found[:2])[2:]
+        _, _, side, signs, palm = max(sides, key=lambda found: found[:2])
+        # Where a thumb beside the fingers encloses more with them than the palm does, the palm still faces where they bend.
+        facing = float(_tensor(palm.direction) @ side) > FACING
+        return signs, palm if facing else self.examine(spread, signs, still, side.double().numpy())
 
     def lean(self, side: Point) -> float:
         """How far the fingers of the hand at rest lean to one side of the palm, and a thumb stands out there [m]."""
@@ -393,7 +398,8 @@ class ClosingFinder:
         """The direction in which straight fingers begin to close [unit vector], if they do it alike."""
         curls, sides = self.sides
         closing = torch.stack([curl.ways * side for curl, side in zip(curls, sides, strict=True)])
-        moved = (self.motion.velocities(self.straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
+        straight = self.wholly_straight
+        moved = (self.motion.velocities(straight) * closing[:, None]).sum(-1)[torch.tensor(sides) != 0]
         way = torch.nn.functional.normalize(moved, dim=-1).mean(0) if len(moved) else torch.zeros(3)
         return _unit(way.double().numpy()) if len(moved) >= LEVEL_FINGERS and float(way.norm()) > TOGETHER else None
 
@@ -401,9 +407,23 @@ class ClosingFinder:
     def straight(self) -> Joints:
         """Straight fingers [rad or m]."""
         bends = self.movable & ~self.sideways & self.stated.isnan()
-        if not bool(bends.any()):
-            return self.start
-        return self.motion.straightest(self.start, bends & ~self.motion.whole(bends), EXACT)
+        return self.motion.straight(self.start, bends & ~self.motion.whole(bends)) if bool(bends.any()) else self.start
+
+    @cached_property
+    def outstretched(self) -> Joints:
+        """Fingers that reach the farthest from their knuckles [rad or m]."""
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        alone = bends & ~self.motion.whole(bends) if bool(bends.any()) else bends
+        return self.motion.straightest(self.start, alone, EXACT) if bool(alone.any()) else self.start
+
+    @cached_property
+    def wholly_straight(self) -> Joints:
+        """Straight fingers, joints that drive a whole one included, unless that bends it far back [rad or m]."""
+        bends = self.movable & ~self.sideways & self.stated.isnan()
+        if not bool(bends.any()) or not bool((whole := bends & self.motion.whole(bends)).any()):
+            return self.straight
+        found = self.motion.straight(self.straight, whole)
+        return torch.where((found - self.straight).abs() < FAR_BACK, found, self.straight)
 
     @cached_property
     def sides(self) -> tuple[list[Curl], list[float]]:
@@ -420,7 +440,12 @@ class ClosingFinder:
         choices = torch.cartesian_prod(*[torch.tensor([1.0, -1.0])] * len(unsure)).reshape(-1, len(unsure))
         tried = torch.tensor(sides).repeat(len(choices), 1)
         tried[:, unsure] = choices
-        ways = tried @ torch.stack([curl.ways for curl in curls])
+        # Fingers that one joint curls close together.
+        each = torch.stack([curl.ways for curl in curls])
+        shared = each @ each.T
+        apart = (tried[:, :, None] * tried[:, None] * shared < 0).flatten(1).any(1)
+        tried = tried[~apart] if bool((~apart).any()) else tried
+        ways = tried @ each
         closed = torch.where(ways > 0, self.tree.upper, torch.where(ways < 0, self.tree.lower, straight))
         meeting = self.motion.meeting(straight, closed)
         best, most = tried[meeting.argmax()], meeting.max()
@@ -434,8 +459,12 @@ class ClosingFinder:
         shares = torch.linspace(1, 0, PATH).tolist()
         path = torch.stack([self.posture(closing.open_ends, closing.opening_signs, closing.abduction, s) for s in shares])
         axis = Line(_tensor(closing.palm.centre), _tensor(closing.palm.direction))
-        both = torch.tensor([curl.back >= BOTH_WAYS for curl in self.sides[0]])
-        return self.motion.folded(path, self.movable & ~closing.abduction, axis, both)
+        both, bends = torch.tensor([curl.back >= BOTH_WAYS for curl in self.sides[0]]), self.movable & ~closing.abduction
+        return self.motion.folded(path, bends, axis, both & ~self.of_one_joint(bends))
+
+    def of_one_joint(self, bends: JointMask) -> Bool[Tensor, " n_tips"]:
+        """Fingers that one joint bends, all of whose postures are as straight."""
+        return (self.tree.moves[self.motion.links] & bends).sum(1) == 1
 
     @cached_property
     def motion(self) -> FingerMotion:
@@ -456,8 +485,8 @@ class ClosingFinder:
         spreading = self.motion.spreading(self.straight, self.sides[0], self.movable, direction, self.sweep)
         return along | self.sideways | spreading
 
-    def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
-        """The palm at the closing where palm and fingers enclose a ball best."""
+    def examine(self, opened: Joints, signs: Joints, abduction: JointMask, faced: Place | None = None) -> Palm:
+        """The palm at the closing where palm and fingers enclose a ball best; it faces a side if one is known or given."""
         jaw, on_palm, on_fingers = self.fixed_jaw(opened, signs, abduction), self.on_palm, self.on_fingers
         if jaw is not None:
             on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
@@ -466,11 +495,12 @@ class ClosingFinder:
         best = max((find_palm(*part) for part in parts), key=lambda palm: palm.score)
         if jaw is not None:
             return dataclasses.replace(best, direction=jaw.direction)
-        if self.sweep is None or best.direction @ self.sweep > FACING:
+        faced = self.sweep if faced is None else faced
+        if faced is None or best.direction @ faced > FACING:
             return best
         with contextlib.suppress(HandError):
-            best = max((find_palm(*part, self.sweep) for part in parts), key=lambda palm: palm.score)
-        return best if best.direction @ self.sweep > FACING else dataclasses.replace(best, direction=self.sweep)
+            best = max((find_palm(*part, faced) for part in parts), key=lambda palm: palm.score)
+        return best if best.direction @ faced > FACING else dataclasses.replace(best, direction=faced)
 
     @cached_property
     def on_fingers(self) -> list[Bool[np.ndarray, " n"]]:

@@ -7,7 +7,7 @@ let it fold back closes on nothing on the way from there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,10 +24,14 @@ from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
 STEPS = 64  # Steps in which a joint's range, or the way from closed to open, is searched (ours)
 SWEEPS = 24  # Most rounds of the search over all joints (ours); hands need 1 to 10
 SAME_SPAN = 1e-4  # Spans that differ by less are the same [m] (ours)
+EXACT = 1e-6  # Reaches that differ by less are the same, where a finger is to be straight whatever joints count from [m] (ours)
 KNUCKLE = 0.5  # Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less
 BEHIND = 0.9
 """Angle by which an opened finger that folds back points behind the plane of its palm [rad] (ours). At the limits of their
 ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.3."""
+TO_WRIST = 2.4
+"""Angle between an open thumb and the other fingers from which on it points to the wrist [rad] (ours): 138 degrees. Of 31 hands
+with a thumb, four have 142 to 160, all others 121 at most, but LEAP's, whose fingers do not lie side by side."""
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
@@ -226,6 +230,21 @@ class FingerMotion:
         """The posture whose fingertips are farthest from their knuckles; of equal ones the one nearest to the start."""
         return self._best(lambda q: self.reaches(q, bends).norm(dim=-1).sum(-1), start, bends, same)
 
+    def straight(self, start: Joints, bends: JointMask) -> Joints:
+        """The posture whose fingertips are farthest from where their fingers begin to curl; of equal ones the nearest."""
+        # A joint before that, as one that spreads the finger, makes it no straighter, wherever its axis is.
+        hinged, firsts = self.hinges(start) & bends, []
+        for finger in self.fingers:
+            curling = [link for link in finger.chain if bool(hinged[self.tree.link_coupling[link] != 0].any())]
+            free = bool(curling) and not bool(self._driving([finger], curling[:1]).any())
+            firsts.append(curling[0] if free else self._knuckle(finger, bends))
+
+        def reach(q: Float[Tensor, "m n_dof"]) -> Float[Tensor, " m"]:
+            begin = se3.apply(self.tree.forward(q)[..., firsts, :, :], self.tree.anchor[firsts])
+            return (self.tips(q) - begin).norm(dim=-1).sum(-1)
+
+        return self._best(reach, start, bends, EXACT)
+
     def _best(
         self, measure: Callable[[Float[Tensor, "m n_dof"]], Float[Tensor, " m"]], start: Joints, moved: JointMask,
         same: float = SAME_SPAN,
@@ -252,8 +271,11 @@ class FingerMotion:
 
     def whole(self, bends: JointMask) -> JointMask:
         """Joints that bend a finger at its knuckle and, by couplings, beyond it: where it reaches farthest, it is not open."""
-        firsts = [self._knuckle(finger, bends) for finger in self.fingers]
-        beyond = [link for finger, first in zip(self.fingers, firsts, strict=True) for link in finger.chain if link > first]
+        return self._driving(self.fingers, [self._knuckle(finger, bends) for finger in self.fingers])
+
+    def _driving(self, fingers: Sequence[Finger], firsts: list[int]) -> JointMask:
+        """Joints that, by couplings, drive the given link of each finger and links beyond it."""
+        beyond = [link for finger, first in zip(fingers, firsts, strict=True) for link in finger.chain if link > first]
         return (self.tree.link_coupling[firsts] != 0).any(0) & (self.tree.link_coupling[beyond] != 0).any(0)
 
     def folded(
@@ -309,7 +331,22 @@ def opening_notes(hand: Hand) -> list[Note]:
         if angle > BEHIND:
             text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
             notes.append(Note("warning", tip, text + " If so, state another open posture"))
-    return notes
+    return notes + _thumb_to_wrist(hand)
+
+
+def _thumb_to_wrist(hand: Hand) -> list[Note]:
+    """A thumb that opens away from fingers that lie side by side, as those of a flat hand do."""
+    if hand.thumb is None:
+        return []
+    reach = FingerMotion.of(hand).reaches(hand.canonical_joints(1.0), hand.movable & ~hand.abduction)
+    along = torch.nn.functional.normalize(reach, dim=-1)
+    others = along[torch.arange(len(along)) != hand.thumb].mean(0)
+    angle = float(torch.acos(torch.nn.functional.cosine_similarity(along[hand.thumb], others, dim=0).clamp(-1, 1)))
+    if angle < TO_WRIST or float(others.norm()) < ALIKE:
+        return []
+    text = (f"points {math.degrees(angle):.0f} degrees away from the other fingers in the open posture, towards the wrist. If "
+            "it is of no use there, state another open posture")
+    return [Note("warning", hand.tree.link_names[hand.tips[hand.thumb]], text)]
 
 
 def guessed_side(hand: Hand) -> Note | None:

@@ -113,6 +113,15 @@ def test_masks_that_show_nothing_are_refused(depth: np.ndarray, mask: np.ndarray
         depth_points(depth, INTRINSICS, mask)
 
 
+@pytest.mark.parametrize("depth_of_one", [-0.1, 0.0, 1e-9, 0.001])
+def test_points_beside_the_camera_are_refused(mug: ObjectModel, depth_of_one: float) -> None:
+    seen = mug.cloud - mug.cloud.mean(0) + [0, 0, 0.5]
+    stray = [0.1, 0, depth_of_one] + np.linspace(0, 0.01, 40)[:, None] * [0, 1, 0]
+    scanned_object("mug", seen)
+    with pytest.raises(ObjectError, match="points behind or beside the camera"):
+        scanned_object("mug", np.concatenate([seen, stray]), denoise=False, keep_table=True)
+
+
 @pytest.mark.parametrize(("median", "units"), [
     (45.0, ["0.45 m in centimetres (divide by 100)"]),
     (600.0, ["6 m in centimetres (divide by 100)", "0.6 m in millimetres (divide by 1000)"]),

@@ -38,6 +38,7 @@ RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
 DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
+LEAST_DEPTH = 0.01  # Depth of a point that a camera sees, as a share of the mean depth [1] (ours)
 FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
@@ -205,9 +206,10 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     if len(rows) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
     check_view(rows[:, :3], name)
-    if float((rows[:, :3] @ rows[:, :3].mean(0)).min()) <= 0:
-        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
-                          "camera's frame")
+    middle = rows[:, :3].mean(0)
+    if float((rows[:, :3] @ middle).min()) <= LEAST_DEPTH * float(middle @ middle):
+        raise ObjectError(f"{name} has points behind or beside the camera, which is at the cloud's origin; give the cloud in "
+                          "the camera's frame")
     return Cleaned(rows, table, cut, total, told)
 
 
