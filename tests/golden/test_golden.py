@@ -28,6 +28,5 @@ def test_results_are_those_that_were_recorded(name: str) -> None:
     # Other processors and libraries round otherwise, and a contact may come out on the other side of a limit.
     for key, values in numbers.items():
         wanted = np.array(recorded["numbers"][key])
-        close = np.isclose(values[:40], wanted, atol=0.02, rtol=0.05)
-        # Where an object comes to rest after six forces, the last digit of a contact decides.
-        assert close.mean() >= (0.5 if key == "displacement" else 0.7), f"{name}: {key} differs"
+        close = np.isclose(values[:40], wanted, atol=0.02, rtol=0.05, equal_nan=True)  # NaN: no force was applied
+        assert close.mean() >= 0.7, f"{name}: {key} differs"

@@ -98,10 +98,10 @@ class RunFolder:
         path, temporary, content = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part", io.BytesIO()
         torch.save(state, content)  # its own writer says of a full disk that a position was not expected
         try:
-            # Path.write_bytes leaves a view in the traceback of a full disk, with which Python 3.12.1 ends later.
-            with self._writing(path), temporary.open("wb") as file, content.getbuffer() as view:
-                file.write(view)
             with self._writing(path):
+                # Path.write_bytes leaves a view in the traceback of a full disk, with which Python 3.12.1 ends later.
+                with temporary.open("wb") as file, content.getbuffer() as view:
+                    file.write(view)
                 os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
