@@ -36,7 +36,7 @@ def complete(
 
 def pregrasp_and_squeeze(
     hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, "3"] | Float[Tensor, "n 1 3"], config: ControllerConfig | None = None,
+    centre: Float[Tensor, "3"] | Float[Tensor, "#n 1 3"], config: ControllerConfig | None = None,
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
     """Joint values q_outer and q_inner of each grasp [rad or m].
 
@@ -60,7 +60,7 @@ def pregrasp_and_squeeze(
 
 def distance_slope(
     hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, "3"] | Float[Tensor, "n 1 3"],
+    centre: Float[Tensor, "3"] | Float[Tensor, "#n 1 3"],
 ) -> Float[Tensor, "n n_dof"]:
     """Derivative by each joint of the mean distance of its downstream points to the object's centre [m/rad or m/m]."""
     tree = hand.tree

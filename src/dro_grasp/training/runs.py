@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from torch import Tensor, distributed, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -266,7 +266,7 @@ class Ahead:
         if self._stream is not None:
             self._stream.wait_stream(torch.cuda.current_stream(device))
         self._thread = ThreadPoolExecutor(1)
-        self._begun: dict[int, Future[tuple[Any, Int[Tensor, " state"], Any]]] = {}
+        self._begun: dict[int, Future[tuple[Any, UInt8[Tensor, " state"], Any]]] = {}
         # The stream's memory may be used again only once the losses have been computed.
         self._kept: deque[Any] = deque(maxlen=kept)
 
@@ -280,7 +280,7 @@ class Ahead:
         self._kept.append(samples)
         return samples
 
-    def _drawn(self, draw: Callable[[torch.Generator], Any], seed: int) -> tuple[Any, Int[Tensor, " state"], Any]:
+    def _drawn(self, draw: Callable[[torch.Generator], Any], seed: int) -> tuple[Any, UInt8[Tensor, " state"], Any]:
         generator = torch.Generator(self.generator.device)
         generator.manual_seed(seed)
         if self._stream is None:
