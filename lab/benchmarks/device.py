@@ -1,31 +1,26 @@
-"""Prediction, synthesis and training on a GPU, beside the processor in the same run.
+"""Prediction and synthesis on a GPU, beside the processor in the same run.
 
 Hands and objects are built in. Prediction is of candidates of the network alone: many of one pair, some of many pairs of one
 hand, and the four of which one grasp is chosen, by stage, with settling and without. The first run, which captures graphs, is
 told apart. Many pairs are of sixteen objects, each of which comes four times as an object of its own. Synthesis is the
-optimiser's descent, without trials. Training is a step of the preset with its own number of object points, in bfloat16 where
-`--mixed` would be given.
+optimiser's descent, without trials; shards are all of it, in one process. `lab.benchmarks.training` is for training.
 
-    python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis] [--bundle FILE] [--quick] [--json]
+    python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--quick] [--json]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 from dro_grasp.devices import require_device
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
@@ -34,9 +29,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import problems_of
-from dro_grasp.training.config import ScheduleConfig, TrainConfig
-from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
-from dro_grasp.training.loop import train
+from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
 from lab.benchmarks.report import emit
 
 HAND, OBJECT = "allegro", "rubber_duck"
@@ -47,13 +40,8 @@ STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
 SETTLED = (False, True)  # Whether candidates close in simulation, on the processor
 DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
-BATCHES = {"cpu": ((4, 4),), "gpu": ((4, 4), (8, 32), (8, 128))}
-"""Hands a step and samples of each."""
-TRAINED = {"multi": (48, False), "paper": (128, True)}
-"""Presets, the object points of a step, and whether a GPU multiplies in bfloat16."""
-STEPS = {"cpu": 4, "gpu": 10}
-WARM_UP = 2
-"""Steps that are not counted."""
+SHARES = {"cpu": (1.0,), "gpu": (1.0, 0.1)}
+"""Shares of what passes that the processor judges again; the first shard also compiles."""
 
 
 def median(run: Callable[[], object], repetitions: int) -> float:
@@ -127,21 +115,16 @@ def descents(device: str, repetitions: int) -> list[list[object]]:
     return rows
 
 
-def training(device: str, bundle: Bundle) -> list[list[object]]:
-    """Rows of training steps: samples of a step, and samples a second."""
-    rows = []
-    for preset, (columns, mixed) in TRAINED.items():
-        network = NetworkConfig.preset(preset)
-        for hands, samples in BATCHES[kind(device)]:
-            schedule = ScheduleConfig(
-                steps=STEPS[kind(device)], device=device, log_every=1, recalibration=1, mixed=mixed and kind(device) == "gpu")
-            with tempfile.TemporaryDirectory() as folder:
-                config = TrainConfig(schedule, hands_per_step=hands, samples_per_hand=samples, columns=columns)
-                train(bundle, network, config, Path(folder), report=lambda *_: None)
-                seconds = [json.loads(line)["seconds"] for line in (Path(folder) / "log.jsonl").read_text().splitlines()]
-            step = (seconds[-1] - seconds[WARM_UP - 1]) / (len(seconds) - WARM_UP)
-            count = hands * samples
-            rows.append(said([f"training, {preset}, {count}", device, *BLANK, f"{1e3 * step / count:.3f}", count / step]))
+def shards(device: str) -> list[list[object]]:
+    """Rows of whole shards, which one process makes and confirms: candidates, and valid grasps a second."""
+    hand, obj, rows = load_hand(HAND), load_object(OBJECT), []
+    for share in SHARES[kind(device)]:
+        config = EngineConfig(confirm=share, synthesis=SynthesisConfig(device=device)).suited()
+        begin = time.perf_counter()
+        _, made = valid_grasps(hand, obj, 0, config)
+        seconds = time.perf_counter() - begin
+        what = f"shard of {made.candidates} candidates, {made.judged} of {made.valid} confirmed"
+        rows.append(said([what, device, *BLANK, f"{1e3 * seconds / made.candidates:.3f}", made.valid / seconds]))
     return rows
 
 
@@ -160,8 +143,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor")
-    parser.add_argument("--bundle", type=Path, help="training bundle, for the speed of training")
-    parser.add_argument("--only", default="prediction,synthesis,training", help="what is measured, by commas")
+    parser.add_argument("--only", default="prediction,synthesis,shards", help="what is measured, by commas")
     parser.add_argument("--quick", action="store_true", help="one repetition")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
@@ -173,11 +155,11 @@ def main() -> None:
             rows += predictions(device, repetitions)
         if "synthesis" in only:
             rows += descents(device, repetitions)
-        if options.bundle and "training" in only:
-            rows += training(device, load_bundle(options.bundle))
+        if "shards" in only:
+            rows += shards(device)
     emit(
         f"{HAND} and {OBJECT}, or 64 objects; pairs x grasps x candidates: median of {repetitions}; milliseconds for each "
-        "candidate or sample", rows, ["what", "device", "first run [s]", *STAGES, "whole", "a second"],
+        "candidate", rows, ["what", "device", "first run [s]", *STAGES, "whole", "a second"],
         {f"{what} {device}": float(str(rate)) for what, device, *_, rate in rows}, options.json,
     )
 

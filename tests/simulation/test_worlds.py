@@ -19,6 +19,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
 from dro_grasp.simulation.outcome import TrialResult
@@ -30,6 +31,8 @@ from dro_grasp.simulation.scene import TrialScene, cached_scene
 from dro_grasp.simulation.trial import settle, simulate
 from dro_grasp.simulation.warp_worlds import Room
 from dro_grasp.simulation.worlds import STATE, WARP
+from dro_grasp.training.data.engine import worker
+from dro_grasp.training.data.engine.worker import EngineConfig
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 
 State = dict[str, np.ndarray]
@@ -263,3 +266,19 @@ def test_a_gpu_judges_as_the_processor_does(monkeypatch: pytest.MonkeyPatch) -> 
     found = simulate(hand, obj, grasps, "strict", device="cuda", confirm=False)
     assert torch.equal(found.success, simulate(hand, obj, grasps, "strict").success)
     pressed(hand, obj, grasps, device="cuda")
+
+
+@pytest.mark.parametrize(("share", "seed", "kept", "judged"), [(1.0, 0, 3, 4), (0.5, 1, 3, 4), (0.5, 0, 4, 2)])
+def test_the_processor_judges_a_share_of_what_a_device_lets_pass_and_all_where_it_refutes(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, share: float, seed: int, kept: int, judged: int
+) -> None:
+    config = EngineConfig("carry", confirm=share, synthesis=SynthesisConfig(device="cuda"))
+    valid, refuted, count = worker._judged(hand, obj, grasps.replace(energy=torch.arange(4.0)), config, seed)
+    assert (len(valid), count) == (kept, judged)
+    assert sum(refuted.values()) == 4 - kept
+    assert torch.equal(valid.energy, torch.arange(float(kept)))
+
+
+def test_without_a_device_nothing_is_judged_twice(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
+    valid, refuted, count = worker._judged(hand, obj, grasps, EngineConfig("carry"), 0)
+    assert (valid, refuted, count) == (grasps, {}, 0)

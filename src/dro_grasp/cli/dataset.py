@@ -43,6 +43,8 @@ class Synthesize:
     ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
     """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
     device: str = "cpu"  # Device: cpu, cuda or cuda:1. What passes there is judged again by the CPU.
+    confirm: float = 1.0
+    """Share of what passes on a device that the CPU judges again; if it refutes more than a tenth, it judges all."""
     scale: float = 1.0  # Factor for the coordinates of the objects: 0.001 for millimetres.
     seed: int = 0  # The same seed gives the same grasps.
     protocol: ProtocolName = DEFAULT_PROTOCOL  # Protocol of the trial that grasps must pass.
@@ -68,7 +70,7 @@ class Synthesize:
         require_distinct(self.hand, objects)
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
-            also=self.also, resettle=self.resettle, close_fingers=not self.keep_idle_fingers,
+            also=self.also, resettle=self.resettle, close_fingers=not self.keep_idle_fingers, confirm=self.confirm,
             synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle))).suited()
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
@@ -95,6 +97,8 @@ class Synthesize:
             raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
+        if not 0 < self.confirm <= 1:
+            raise OptionError(f"--confirm is {self.confirm}; give a share above 0 and up to 1, which judges all")
         if not 0 <= self.idle <= 1:
             raise OptionError(f"--idle is {self.idle}; give a probability, from 0 (every finger holds) to 1")
 

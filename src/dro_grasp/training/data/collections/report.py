@@ -149,6 +149,8 @@ def _failures(hand: HandCoverage) -> str:
             ["not evaluated: closing moved the object too far", yields.moved, None],
             *[[reason, n, None] for reason, n in sorted(yields.failures.items(), key=lambda item: -item[1])],
             ["near-duplicates", yields.duplicates, None], ["valid", yields.valid, None]]
+    if yields.judged:
+        rows.append(["passed on a device, judged again by the CPU", yields.judged, None])
     return table(["outcome of candidates", "number", "share"], [
         [name, n, share or _percent(n, yields.candidates)] for name, n, share in rows
     ])

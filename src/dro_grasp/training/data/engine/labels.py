@@ -60,11 +60,11 @@ def also_passing(
     """Of grasps that passed a first protocol, those that pass further ones too, and how many fail each, by reason.
 
     What was measured stays that of the first trial; the protocols are all named, and `robustness` is that of the one that
-    perturbs. Only what has passed one protocol is tried under the next.
+    perturbs. Only what has passed one protocol is tried under the next. A device's verdict is not confirmed here.
     """
     failures: Counter[str] = Counter()
     for rules in protocols:
-        trial = simulate(hand, obj, passed, rules, workers=workers, device=device)
+        trial = simulate(hand, obj, passed, rules, workers=workers, device=device, confirm=False)
         failures.update(f"{failure.value} under {rules.name}" for failure in trial.failure if failure)
         robustness = torch.where(trial.robustness.isnan(), passed.robustness, trial.robustness)
         labels = tuple(f"{label}, {rules.label}" for label in passed.protocol)

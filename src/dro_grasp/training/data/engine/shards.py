@@ -47,6 +47,7 @@ class Yield:
     failures: dict[str, int] = field(default_factory=dict)  # failed trials by reason
     duplicates: int = 0  # passed, but near-duplicates of an earlier grasp
     valid: int = 0  # passed and stored
+    judged: int = 0  # of what passed on a device, tried again by the processor; what it refutes is among the failures
     cpu_seconds: float = 0.0  # CPU time without loading hand and object [s]
     preparation_seconds: float = 0.0
     """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+import math
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -33,6 +34,8 @@ from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
 
 ON_DEVICE = {"candidates": 2048, "min_candidates": 1024, "max_candidates": 4096, "candidate_budget": 65536}
 """Sizes of shards whose candidates are made on a device, which takes as long for few (ours)."""
+AGREEMENT = 0.9
+"""Share of a device's passes that the processor must agree with; with less, it judges them all (ours: 98 % was measured)."""
 LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
 
 
@@ -77,6 +80,9 @@ class EngineConfig(Checked):
     shard: tuple[int, int] = (1, 1)
     """Which part of the pairs this run fills, and of how many: (3, 16) is the third of sixteen, as `--shard 3/16`. Runs of all
     parts may fill one folder at the same time, and together make the same grasps as one run."""
+    confirm: float = 1.0
+    """Share of what passes on a device that the processor judges again; the device's verdict stands for the rest, unless the
+    processor lets less than AGREEMENT of the share pass."""
     shard_seconds: float = 1800.0
     """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
@@ -86,6 +92,8 @@ class EngineConfig(Checked):
         super().__post_init__()
         if not 1 <= self.shard[0] <= self.shard[1]:
             raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
+        if not 0 < self.confirm <= 1:
+            raise OptionError(f"confirm is {self.confirm}; give the share that the processor judges again, above 0 and up to 1")
 
     def suited(self) -> EngineConfig:
         """With shards as large as suits the device."""
@@ -161,27 +169,52 @@ def valid_grasps(
         grasps = closed[shift < config.max_shift]
     passed, failures = _passing(hand, obj, grasps, config)
     new = distinct(hand, passed, earlier=earlier)
-    return passed[new], dataclasses.replace(
-        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum()))
+    valid, refuted, judged = _judged(hand, obj, passed[new], config, seed)
+    return valid, dataclasses.replace(
+        made, failures=dict(failures + refuted), duplicates=int((~new).sum()), judged=judged, valid=len(valid))
 
 
 def _passing(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig
 ) -> tuple[GraspBatch, Counter[str]]:
-    """The grasps that pass all protocols with enough contact, and why the others fail."""
+    """The grasps that pass all protocols with enough contact where candidates are made, and why the others fail."""
     restless, device = 0, config.synthesis.device
     if config.resettle and len(grasps):
         grasps, stable = at_rest(hand, obj, grasps, config.close_fingers, device)
         restless, grasps = int((~stable).sum()), grasps[stable]
-    trial = simulate(hand, obj, grasps, config.protocol, workers=1, device=device)
+    passed, failures = _tried(hand, obj, grasps, config, device, config.close_fingers and not config.resettle)
+    return passed, failures + Counter({RESTLESS: restless})
+
+
+def _tried(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig, device: str, close_fingers: bool = False
+) -> tuple[GraspBatch, Counter[str]]:
+    """The grasps that pass trials on a device with enough contact, and why the others fail; idle fingers may close between."""
+    trial = simulate(hand, obj, grasps, config.protocol, workers=1, device=device, confirm=False)
     loose = trial.success & (trial.contacts < config.min_contact_links)
     passed = grasps.with_trial(trial)[trial.success & ~loose]
-    if config.close_fingers and not config.resettle and len(passed):
+    if close_fingers and len(passed):
         passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, 1, device)
     failures = Counter(failure.value for failure in trial.failure if failure)
-    failures += Counter({LOOSE: int(loose.sum()), RESTLESS: restless})
     passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], 1, device)
-    return passed, failures + later
+    return passed, failures + Counter({LOOSE: int(loose.sum())}) + later
+
+
+def _judged(
+    hand: Hand, obj: ObjectModel, valid: GraspBatch, config: EngineConfig, seed: int
+) -> tuple[GraspBatch, Counter[str], int]:
+    """Valid grasps without those that the processor refutes, why it does, and how many it judged: a share drawn at random."""
+    if not on_accelerator(config.synthesis.device) or not len(valid):
+        return valid, Counter(), 0
+    order = torch.randperm(len(valid), generator=torch.Generator().manual_seed(seed))
+    count = math.ceil(config.confirm * len(valid))
+    held, refuted = _tried(hand, obj, valid[order[:count]], config, "cpu")
+    others = valid[order[count:]]
+    if len(held) < AGREEMENT * count:
+        others, more = _tried(hand, obj, others, config, "cpu")
+        refuted, count = refuted + more, len(valid)
+    kept = GraspBatch.concatenate([held, others])
+    return kept[kept.energy.argsort(stable=True)], refuted, count
 
 
 def closed_where_it_holds(
@@ -190,7 +223,7 @@ def closed_where_it_holds(
 ) -> GraspBatch:
     """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
 
-    Column `relabelled` marks them. Their energies stay those by which the grasp was once chosen.
+    Column `relabelled` marks them. A device's verdict is not confirmed here. Energies stay those by which grasps were chosen.
     """
     known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
     relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
@@ -199,7 +232,7 @@ def closed_where_it_holds(
     rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
     if not len(rows):
         return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
-    trial = simulate(hand, obj, closed[rows], protocol, workers=workers, device=device)
+    trial = simulate(hand, obj, closed[rows], protocol, workers=workers, device=device, confirm=False)
     better = trial.success & (trial.contacts >= min_links)
     better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
     order = torch.arange(len(evaluated))
