@@ -454,7 +454,9 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
 
 def test_sigterm_removes_what_was_uploaded(tmp_path: Path) -> None:
     code = ("import sys; from dro_grasp.apps.library import Library; from dro_grasp.apps.viewer.scene_view import serve\n"
-            "from types import SimpleNamespace; import time\n"
+            "from types import SimpleNamespace; import signal, time\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored where tests run in the background
+            "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # and that under nohup
             "library = Library(); library.take('a.stl', b'solid', 'object')\n"
             "server = SimpleNamespace(sleep_forever=lambda: time.sleep(60))\n"
             "serve(SimpleNamespace(url='here', server=server, stop=library.close))\n")
