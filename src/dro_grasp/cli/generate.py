@@ -261,11 +261,12 @@ class Generate:
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
         from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.perception.scan import load_scan
         from dro_grasp.objects.shape import with_mass
 
         if camera is None:
             return load_object(name, scale=self.scale, keep_table=self.keep_table, mass=self.mass)
+        from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
+
         scan = load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
         return scan if self.mass is None else with_mass(scan, self.mass)
 
