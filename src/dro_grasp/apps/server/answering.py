@@ -131,7 +131,9 @@ class Answerer:
             obj.cut(progress)
         made = self.predictor.run(problem, request, progress)
         begin, protocol = time.perf_counter(), protocol_for(obj, call.protocol)
-        grasps = made.grasps if protocol == NO_TRIAL else evaluate(problem, made.grasps, protocol, progress)
+        # The command's predictor records the file of an object that no camera saw, which has none here.
+        grasps = recorded(made.grasps, None, None if call.camera else call.path, call.object.scale)
+        grasps = grasps if protocol == NO_TRIAL else evaluate(problem, grasps, protocol, progress)
         trial = time.perf_counter() - begin if bool(grasps.evaluated.any()) else 0.0
         frame = "object" if call.camera is None else call.camera.frame
         told = told_of(obj, made, grasps, Asked(
