@@ -123,7 +123,6 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float |
 def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
     """The object, whatever was stated of its mass; a table in its cloud is kept if the grasps kept it."""
     from dro_grasp.objects.catalogue import load_object
-    from dro_grasp.objects.perception.scan import load_scan
 
     if given is not None:
         return load_object(given, scale=scale)
@@ -134,6 +133,8 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMod
         def loaded(keep_table: bool) -> ObjectModel:
             if pose is None:
                 return load_object(source, scale=own_scale, keep_table=keep_table)
+            from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
+
             return load_scan(Path(source), pose.double().numpy(), own_scale, keep_table)
 
         obj, hashes = loaded(keep_table=False), set(grasps.object_sha256) - {""}
