@@ -18,6 +18,8 @@ from dro_grasp.kinds import FORMER_CONSTRAINTS, checked, present
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+else:
+    ArrayLike = Any  # without NumPy, which names and files do without
 
 
 class GraspClient:
