@@ -124,7 +124,7 @@ def _hints(owner: Any) -> dict[str, Any]:
         found = get_type_hints(owner)
     else:  # what a function returns is not looked at: its name need not be known where the function is
         given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
-        found = get_type_hints(SimpleNamespace(__annotations__=given), owner.__globals__)
+        found = get_type_hints(SimpleNamespace(__annotations__=given), inspect.unwrap(owner).__globals__)
     return {name: kind for name, kind in found.items() if _is_known(kind)}
 
 

@@ -171,7 +171,7 @@ def float_column(values: Float[Tensor, "n *k"]) -> pa.Array:
     if array.ndim == 1:
         return plain_column(array, np.isnan(array))
     ends = np.arange(1, len(array) + 1) * array.shape[1]
-    return list_column(ends, plain_column(array.ravel()), np.isnan(array).any(1))
+    return list_column(ends, plain_column(array.ravel()), np.asarray(np.isnan(array).any(1)))
 
 
 def plain_column(values: Num[np.ndarray, " n"], missing: Bool[np.ndarray, " n"] | None = None) -> pa.Array:
