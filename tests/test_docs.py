@@ -160,7 +160,7 @@ def test_a_request_that_cannot_be_met_says_what_the_page_says(capsys: pytest.Cap
 
 def test_json_example_has_the_keys_of_generate() -> None:
     (example,) = (e for e in (json.loads(text) for _, text in blocks("json")) if "seconds" in e)
-    source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
+    source = (ROOT / "src" / "dro_grasp" / "apps" / "report.py").read_text()
     assert all(f'"{key}":' in source for key in example)
     assert list(example["seconds"]) == [
         "start", "load", "network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease", "trial",

@@ -62,7 +62,9 @@ class ClusterError(DroGraspError):
 class ServerError(DroGraspError):
     """A grasp server refuses a request, fails, or is not there."""
 
-    def __init__(self, message: str, retry_after: float | None = None) -> None:
+    def __init__(self, message: str, retry_after: float | None = None, status: int | None = None) -> None:
         super().__init__(message)
         self.retry_after = retry_after
         """When it is worth while to ask again [s]; None where that is not known."""
+        self.status = status
+        """The status of HTTP that it answered with; None where it did not answer."""

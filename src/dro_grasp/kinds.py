@@ -8,7 +8,7 @@ import inspect
 import operator
 import warnings
 from collections.abc import Callable, Mapping
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from dro_grasp.errors import OptionError
@@ -120,7 +120,12 @@ def _is_known(kind: Any) -> bool:
 @functools.cache
 def _hints(owner: Any) -> dict[str, Any]:
     """The kinds of a dataclass's fields or of a function's arguments, without those that are not checked."""
-    return {name: kind for name, kind in get_type_hints(owner).items() if name != "return" and _is_known(kind)}
+    if isinstance(owner, type):
+        found = get_type_hints(owner)
+    else:  # what a function returns is not looked at: its name need not be known where the function is
+        given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
+        found = get_type_hints(SimpleNamespace(__annotations__=given), inspect.unwrap(owner).__globals__)
+    return {name: kind for name, kind in found.items() if _is_known(kind)}
 
 
 def flat(record: Any, prefix: str = "") -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -12,9 +14,9 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.outcome import Failure
-from dro_grasp.simulation.piercing import pierced
+from dro_grasp.simulation.piercing import _Rest, bones, pierced
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.scene import cached_scene
+from dro_grasp.simulation.scene import build_scene, cached_scene
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -68,3 +70,19 @@ def test_a_trial_refuses_a_pierced_sheet(sheet: ObjectModel) -> None:
     through = [grasp(sheet, ORIGINS[1] + share * (ORIGINS[3] - ORIGINS[1]), ALONG) for share in np.linspace(0.05, 0.95, 19)]
     assert all(measure_penetration(scene, grasps).object[0] > 0.02 for grasps in through)
     assert simulate(HAND, sheet, through[0], "strict", workers=1).failure == (Failure.PENETRATION,)
+
+
+def test_fingers_axes_are_sought_once_for_all_objects_and_processes(
+    sheet: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another object, in what stands for another process, finds those that are stored; another hand does not."""
+    monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path))
+    rules = protocol("strict")
+    first = bones.__wrapped__(build_scene(HAND, sheet, rules))
+    assert len(first) > 3
+    monkeypatch.setattr(_Rest, "bones", lambda _: pytest.fail("they are sought again"))
+    for found, bone in zip(bones.__wrapped__(build_scene(HAND, load_object("can"), rules)), first, strict=True):
+        assert (found.body, found.beyond) == (bone.body, bone.beyond)
+        np.testing.assert_array_equal(np.stack([found.start, found.end]), np.stack([bone.start, bone.end]))
+    with pytest.raises(pytest.fail.Exception, match="sought again"):
+        bones.__wrapped__(build_scene(loaded_hand("gripper3"), sheet, rules))

@@ -11,11 +11,11 @@ from functools import cached_property, lru_cache
 import mujoco
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float, Int
 
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.hands.description.compiling import collide

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.remote import generate_at, server_of
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from dro_grasp.predict.predictor import GraspPredictor, Prediction
     from dro_grasp.predict.problem import GraspProblem
 
-ROWS_SHOWN = 16  # Grasps listed in the table
 TOGETHER = 64  # Objects of a folder that a GPU predicts together (ours): their distances fill some gigabytes
 
 
@@ -83,9 +82,13 @@ class Generate:
     """Picture of the best grasps. With a folder of objects: an existing folder, for one picture an object."""
     view: Flag = False  # Open the viewer on the result.
     json: Flag = False  # Print one JSON object instead of a table.
+    server: Annotated[str | None, optional("URL|none", "DRO_GRASP_SERVER, or none")] = None
+    """Address of a grasp server (`dro-grasp serve`) that does the work, which saves loading. It knows hands by name."""
 
     def run(self) -> int:
-        """Check everything that can be checked before the work, then do it."""
+        """Check everything that can be checked before the work, then do it, or let a server do it."""
+        if (address := server_of(self.server)) is not None:
+            return generate_at(address, self)
         from dro_grasp.errors import DroGraspError
 
         with progress_bar("loading libraries, hand and weights", self.json):
@@ -175,19 +178,18 @@ class Generate:
 
     def _ready(self, job: Job, name: str, first: GraspProblem | None) -> Ready:
         """An object, read and cut, as a problem beside the first of its part."""
-        from dro_grasp.errors import OptionError
+        from dro_grasp.apps.report import doubt, require_trial
         from dro_grasp.predict.problem import GraspProblem
 
         begin = time.perf_counter()
         with progress_bar(f"reading {Path(name).name}", self.json):
             obj = self._load(name, job.camera)
         seconds = time.perf_counter() - begin
-        if self.only_successful and self._protocol(obj) == "none":
-            raise OptionError(f"--only-successful saves what passed a trial, and '{obj.name}' gets none; name a "
-                              "--protocol, which needs a mesh, or leave out --only-successful")
+        if self.only_successful:
+            require_trial(obj, self.protocol)
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        if (warning := self._warning(job, obj)) is not None:
+        if (warning := doubt(job.constraints, obj, job.camera is not None)) is not None:
             say_aside(f"warning: {obj.name}: {warning}")
         problem = GraspProblem(job.hand, obj, self.device, job.constraints) if first is None else first.beside(obj)
         self._cut(obj)
@@ -195,9 +197,8 @@ class Generate:
 
     def _finish(self, job: Job, predicted: Predicted, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """Trials, files and report of one object."""
-        from dro_grasp.compare.metrics import success_rate
+        from dro_grasp.apps.report import Asked, protocol_for, told_of
         from dro_grasp.grasps.sources import with_sources
-        from dro_grasp.simulation.outcome import count_failures, next_steps
 
         problem, made, begin = predicted.problem, predicted.made, time.perf_counter()
         obj, seconds = problem.obj, {**job.seconds, "load": job.seconds["load"] + predicted.load}
@@ -205,40 +206,30 @@ class Generate:
             say_aside(f"warning: {obj.name}: {made.shortage}")
         middle = time.perf_counter()
         grasps = self._evaluate(problem, made.grasps)
-        simulated = bool(grasps.evaluated.any())
-        seconds |= {**made.seconds, "trial": time.perf_counter() - middle if simulated else 0.0}
-        success = int(grasps.success.sum()) if simulated else None
-        rate, *interval = success_rate(success or 0, self.num)
-        report = {
-            "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
-            "candidates": made.candidates, "dropped": made.dropped,
-            "origin": dict(Counter(made.origin)), "origins": made.origin,
-            "payload": grasps.payload.tolist(), "squeeze_force": grasps.squeeze_force.tolist(),
-            "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
-            "success": success, "success_rate": rate if simulated else None, "interval_95": interval if simulated else None,
-            "reasons": count_failures(grasps), "next": next_steps(grasps), "seconds": {},
-            "output": None if output is None else str(output),
-            "picture": None, "frame": "object" if job.camera is None else job.camera.frame,
-        }
+        seconds |= {**made.seconds, "trial": time.perf_counter() - middle if bool(grasps.evaluated.any()) else 0.0}
+        told = told_of(obj, made, grasps, Asked(
+            job.hand.name, self.num, self.seed, job.predictor.weights_name, protocol_for(obj, self.protocol),
+            "object" if job.camera is None else job.camera.frame))
+        told.report["output"] = None if output is None else str(output)
         middle = time.perf_counter()
         kept, points = grasps, made.points
         if self.only_successful:
             kept, points = grasps[grasps.success], points[grasps.success]
         if not len(kept):
-            self._say_that_none_is_left(obj.name, output, picture)
+            self.say_that_none_is_left(obj.name, output, picture)
         if output is not None:
             with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
         if picture is not None and len(kept):
             from dro_grasp.pictures.sheets import draw_grasps
 
-            report["picture"] = str(picture)
+            told.report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept, picture)
         total = sum(job.seconds.values()) + predicted.load + predicted.share + time.perf_counter() - begin
         seconds |= {"files": time.perf_counter() - middle, "total": total}
-        report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
+        told.report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
-            self._show(report, grasps, made.origin)
-        return ObjectResult(report, obj, kept, points)
+            self.show(*told)
+        return ObjectResult(told.report, obj, kept, points)
 
     def _cut(self, obj: ObjectModel) -> None:
         """Cut a mesh into convex parts, which may take most of a minute the first time; says what comes of it."""
@@ -251,7 +242,7 @@ class Generate:
             if note not in said:
                 say_aside(f"{obj.name}: {note}")
 
-    def _say_that_none_is_left(self, name: str, output: Path | None, picture: Path | None) -> None:
+    def say_that_none_is_left(self, name: str, output: Path | None, picture: Path | None) -> None:
         """Say what comes of it that no grasp succeeded, of all that was asked for."""
         for asked, outcome in ((output, f"{output} holds none"), (picture, f"{picture} is not drawn"),
                                (self.view, "there is none to view")):
@@ -261,62 +252,33 @@ class Generate:
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
         from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.perception.scan import load_scan
         from dro_grasp.objects.shape import with_mass
 
         if camera is None:
             return load_object(name, scale=self.scale, keep_table=self.keep_table, mass=self.mass)
+        from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
+
         scan = load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
         return scan if self.mass is None else with_mass(scan, self.mass)
 
-    def _warning(self, job: Job, obj: ObjectModel) -> str | None:
-        """What is odd about the table, in words; None for nothing."""
-        if obj.is_cloud and obj.table is None and self.table is not None and job.camera is None:
-            return (f"--table {self.table:g} counts along the z axis of the cloud. If that is a camera's, which points "
-                    "forward, give the camera's pose with --camera")
-        return job.constraints.warning(obj)
-
-    def _protocol(self, obj: ObjectModel) -> str:
-        return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)
-
     def _evaluate(self, problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+        from dro_grasp.apps.report import NO_TRIAL, protocol_for
         from dro_grasp.predict.stages import evaluate
 
-        protocol = self._protocol(problem.obj)
-        if protocol == "none":
+        protocol = protocol_for(problem.obj, self.protocol)
+        if protocol == NO_TRIAL:
             return grasps
         with progress_bar("evaluating", self.json) as progress:
             return evaluate(problem, grasps, protocol, progress)
 
-    def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
-        from dro_grasp.grasps.batch import percent
-        from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-        from dro_grasp.grasps.forces import forces_of_all, known, short
-        from dro_grasp.simulation.outcome import diagnose
-
-        rows = []
-        for i in range(min(len(grasps), ROWS_SHOWN)):
-            outcome: list[Any] = [None] * 4
-            if grasps.evaluated[i]:
-                outcome = [bool(grasps.success[i]), len(grasps.extra[CONTACT_LINKS][i]), float(grasps.penetration[i]) * 1e3,
-                           grasps.extra[REASON][i]]
-            forces = (None if x is None else short(x) for x in (known(grasps.payload[i]), known(grasps.squeeze_force[i])))
-            rows.append([i, origin[i], percent(float(grasps.confidence[i])), *forces, *outcome])
+    def show(self, report: dict[str, Any], rows: list[list[Any]], lines: list[str]) -> None:
+        """Print the table, and what is told under it."""
         columns = ["grasp", "origin", "confidence", "carries [kg]", "squeeze [N]", "success", "contacts", "penetration [mm]",
                    "reason"]
-        seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)
-        say(seconds)
-        if report["dropped"]:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items())
-            say(f"{report['candidates']} candidates; dropped: {reasons}")
-        if report["success"] is not None:
-            found = "" if report["num"] == self.num else f", {report['num']} were found"
-            say(f"{report['success']} of {self.num} grasps succeeded under protocol {report['protocol']}{found}")
-            for line in diagnose(grasps):
-                say(line)
-        if told := forces_of_all(grasps):
-            say(f"they {told}")
+        say("  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items()))
+        for line in lines:
+            say(line)
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
                 say(f"{what}: {report[key]}")

@@ -1,14 +1,39 @@
-"""Mesh files, read by trimesh within limits: of size, and of what else they may open."""
+"""Mesh files, read by trimesh within limits: of size, and of what else they may open.
+
+trimesh is imported here for the whole package, without SciPy's optimisers: they take longer to import than trimesh.
+"""
 
 from __future__ import annotations
 
 import io
+import sys
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-import trimesh
+OPTIMISERS = "scipy.optimize"
+"""Module of which trimesh takes `leastsq` as it is imported, for a function that nothing here calls (ours)."""
+
+
+def leastsq(*args: Any, **options: Any) -> Any:
+    """SciPy's own, once somebody calls it."""
+    from scipy import optimize
+
+    return optimize.leastsq(*args, **options)
+
+
+if OPTIMISERS in sys.modules:
+    import trimesh
+else:
+
+    sys.modules[OPTIMISERS] = ModuleType(OPTIMISERS)
+    sys.modules[OPTIMISERS].__dict__["leastsq"] = leastsq
+    try:
+        import trimesh
+    finally:
+        del sys.modules[OPTIMISERS]
 
 MAX_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory
 

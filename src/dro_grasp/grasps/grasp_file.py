@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Num, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
@@ -168,18 +168,60 @@ def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, A
 def float_column(values: Float[Tensor, "n *k"]) -> pa.Array:
     """A float tensor (n) or (n k) as a column; rows with NaN become null."""
     array = values.detach().cpu().to(torch.float32).numpy()
-    missing = np.isnan(array) if array.ndim == 1 else np.isnan(array).any(1)
     if array.ndim == 1:
-        return pa.array(array, mask=missing)
-    offsets = np.arange(len(array) + 1, dtype=np.int32) * array.shape[1]
-    flat = pa.array(np.ascontiguousarray(array).ravel())
-    return pa.ListArray.from_arrays(pa.array(offsets), flat, mask=pa.array(missing))
+        return plain_column(array, np.isnan(array))
+    ends = np.arange(1, len(array) + 1) * array.shape[1]
+    return list_column(ends, plain_column(array.ravel()), np.asarray(np.isnan(array).any(1)))
+
+
+def plain_column(values: Num[np.ndarray, " n"], missing: Bool[np.ndarray, " n"] | None = None) -> pa.Array:
+    """Numbers as a column; those that are missing become null.
+
+    Columns are put together from buffers: `pa.array` would import pandas, where that is installed, which takes longer than all
+    else that is done to a file.
+    """
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [_present(missing), _buffer(values)])
+
+
+def truth_column(values: Bool[np.ndarray, " n"], missing: Bool[np.ndarray, " n"]) -> pa.Array:
+    """Truth values as a column; those that are missing become null."""
+    return pa.Array.from_buffers(pa.bool_(), len(values), [_present(missing), _bits(values)])
+
+
+def text_column(values: Sequence[str | None]) -> pa.Array:
+    """Texts as a column; None becomes null."""
+    encoded = [(value or "").encode() for value in values]
+    missing = np.array([value is None for value in values], bool)
+    buffers = [_present(missing), _offsets(np.cumsum([len(text) for text in encoded])), pa.py_buffer(b"".join(encoded))]
+    return pa.Array.from_buffers(pa.string(), len(encoded), buffers)
+
+
+def list_column(ends: Int[np.ndarray, " n"], elements: pa.Array, missing: Bool[np.ndarray, " n"]) -> pa.Array:
+    """Lists, of which each ends where `ends` says among all their elements, as a column."""
+    buffers = [_present(missing), _offsets(ends)]
+    return pa.Array.from_buffers(pa.list_(elements.type), len(ends), buffers, children=[elements])
+
+
+def _present(missing: Bool[np.ndarray, " n"] | None) -> pa.Buffer | None:
+    return None if missing is None or not missing.any() else _bits(~missing)
+
+
+def _bits(values: Bool[np.ndarray, " n"]) -> pa.Buffer:
+    return _buffer(np.packbits(values, bitorder="little"))
+
+
+def _offsets(ends: Num[np.ndarray, " n"]) -> pa.Buffer:
+    return _buffer(np.concatenate([[0], ends]).astype(np.int32))
+
+
+def _buffer(values: Shaped[np.ndarray, " n"]) -> pa.Buffer:
+    return pa.py_buffer(np.ascontiguousarray(values))
 
 
 def fixed_column(values: Float[Tensor, "n k"]) -> pa.Array:
     """A float tensor (n k) without missing rows as a column of fixed-size lists."""
     array = np.ascontiguousarray(values.detach().cpu().to(torch.float32).numpy())
-    return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
+    return pa.FixedSizeListArray.from_arrays(plain_column(array.ravel()), array.shape[1])
 
 
 def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Float[Tensor, "n *width"]:
@@ -205,8 +247,8 @@ def _numbers(array: pa.Array) -> Float[np.ndarray, " n"]:
 
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")  # Columns without which a file holds no grasps
-TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
-"""Types of the trial's further columns, which their values do not tell when all are unknown."""
+TEXTS = {columns.REASON, columns.FAILURE}
+"""Further columns of the trial that hold texts, which their values do not tell when all are unknown."""
 SYNTHESIZED = re.compile(r"\bsynthesis \d+\b")
 """Provenance of synthesized grasps, whose `score` is minus the energy in files without a column `energy`."""
 
@@ -216,17 +258,16 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     if (fault := columns.protocol_fault(batch.protocol)) is not None:
         raise GraspFileError(f"{fault}; name it so before the grasps are saved")
     stored: dict[str, pa.Array] = {
-        "object": pa.array(list(batch.object), pa.string()),
+        "object": text_column(batch.object),
         "wrist_position": fixed_column(batch.T_object_wrist[:, :3, 3]),
         "wrist_quaternion_wxyz": fixed_column(batch.wrist_quaternion_wxyz),
         "joints": float_column(batch.joints),
     }
     stored |= {name: float_column(getattr(batch, name)) for name in (*columns.PER_JOINT, *columns.FLOATS)}
-    stored["success"] = pa.array(batch.trial_success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
-    stored["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
-    for name in columns.TEXTS[1:]:
-        stored[name] = pa.array(list(getattr(batch, name)), pa.string())
-    stored["seed"] = pa.array(batch.seed.cpu().numpy())
+    stored["success"] = truth_column(batch.trial_success.cpu().numpy(), (~batch.evaluated).cpu().numpy())
+    stored["protocol"] = text_column([p or None for p in batch.protocol])
+    stored |= {name: text_column(getattr(batch, name)) for name in columns.TEXTS[1:]}
+    stored["seed"] = plain_column(batch.seed.cpu().numpy())
     stored |= {name: _further_column(name, value) for name, value in batch.extra.items()}
     header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
               "joint_names": list(batch.joint_names)}
@@ -238,7 +279,14 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
 def _further_column(name: str, value: Any) -> pa.Array:
     if isinstance(value, Tensor):
         return float_column(value) if value.is_floating_point() else pa.array(value.cpu().numpy().tolist())
-    return pa.array(list(value), TEXT_TYPES.get(name))
+    if name == columns.CONTACT_LINKS:
+        links = [() if own is None else own for own in value]
+        missing = np.array([own is None for own in value], bool)
+        names = text_column([link for own in links for link in own])
+        return list_column(np.cumsum([len(own) for own in links]), names, missing)
+    if name in TEXTS or (value and all(isinstance(one, str) for one in value)):
+        return text_column(value)
+    return pa.array(list(value))
 
 
 def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]:

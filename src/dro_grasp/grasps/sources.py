@@ -25,17 +25,31 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
 
     `camera` is the pose of the camera that saw the object, in the frame of the grasps.
     """
-    import torch
+    file = given_path(obj)
+    return recorded(grasps, hand_file(hand), str(file.resolve()) if file.is_file() else None, scale, camera)
 
+
+def hand_file(hand: str) -> str | None:
+    """The file of a hand, and the part of it, if it was given by its path."""
     from dro_grasp.hands.description.loader import named, split_part
     from dro_grasp.hands.library import locate_hand
 
-    n, extra = len(grasps), dict(grasps.extra)
     file, link = split_part(hand)
-    if given_path(file).is_file() and locate_hand(hand).path == given_path(file):
-        extra[HAND_FILE] = (named(given_path(file).resolve(), link),) * n
-    if given_path(obj).is_file():
-        extra[OBJECT_FILE] = (str(given_path(obj).resolve()),) * n
+    own = given_path(file).is_file() and locate_hand(hand).path == given_path(file)
+    return named(given_path(file).resolve(), link) if own else None
+
+
+def recorded(
+    grasps: GraspBatch, hand: str | None, obj: str | None, scale: float, camera: NamedMotion | None = None
+) -> GraspBatch:
+    """Grasps of one object that record the files of their hand and object, as far as these have any, and the camera."""
+    import torch
+
+    n, extra = len(grasps), dict(grasps.extra)
+    if hand is not None:
+        extra[HAND_FILE] = (hand,) * n
+    if obj is not None:
+        extra[OBJECT_FILE] = (obj,) * n
         extra[OBJECT_SCALE] = torch.full((n,), scale)
     if camera is not None:
         extra[FRAME] = (camera.frame,) * n
@@ -109,7 +123,6 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float |
 def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
     """The object, whatever was stated of its mass; a table in its cloud is kept if the grasps kept it."""
     from dro_grasp.objects.catalogue import load_object
-    from dro_grasp.objects.perception.scan import load_scan
 
     if given is not None:
         return load_object(given, scale=scale)
@@ -120,6 +133,8 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMod
         def loaded(keep_table: bool) -> ObjectModel:
             if pose is None:
                 return load_object(source, scale=own_scale, keep_table=keep_table)
+            from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
+
             return load_scan(Path(source), pose.double().numpy(), own_scale, keep_table)
 
         obj, hashes = loaded(keep_table=False), set(grasps.object_sha256) - {""}

@@ -6,14 +6,15 @@ import difflib
 import importlib
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
-from dro_grasp.hands.build import build_hand
-from dro_grasp.hands.description.loader import Description, load_description, named, split_part
-from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
+
+if TYPE_CHECKING:
+    from dro_grasp.hands.description.loader import Description
+    from dro_grasp.hands.hand import Hand
 
 BUILTIN_FOLDER = Path(__file__).parent / "builtin"  # Folder of the built-in descriptions
 ASSET_FILES = {
@@ -50,12 +51,16 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
         HandError: No such hand, or its description cannot be used.
         OptionError: The hand cannot have so many points, or so few.
     """
+    from dro_grasp.hands.build import build_hand  # names of hands are asked for without PyTorch
+
     description, label = load_hand_description(name)
     return build_hand(description, name=label, seed=seed, n_points=n_points)
 
 
 def load_hand_description(name: str | Path) -> tuple[Description, str]:
     """The description of a hand, and the hand's name; derives neither points nor palm."""
+    from dro_grasp.hands.description.loader import load_description
+
     found = locate_hand(name)
     return load_description(found.path, found.link), found.name
 
@@ -76,6 +81,8 @@ class HandFile(NamedTuple):
 
 def locate_hand(name: str | Path) -> HandFile:
     """The file of a hand, and its part; the file need not exist. HandError: no hand has this name."""
+    from dro_grasp.hands.description.loader import named, split_part
+
     text, link = split_part(str(name))
     path, label = _locate(text)
     return HandFile(path, named(label, link), link)

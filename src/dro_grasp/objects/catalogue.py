@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.kinds import checked
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import as_part

@@ -12,10 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from dro_grasp.files import MAX_QUOTED_CHARS
+from dro_grasp.geometry.mesh_files import trimesh
 
 LOOK_EVERY = 0.5  # Time between looks at the process [s] (ours)
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int, Num
 from scipy.spatial import KDTree, QhullError
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash

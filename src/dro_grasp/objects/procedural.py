@@ -6,10 +6,10 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-import trimesh
 from numpy.random import Generator
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.solids import Pieces, Point, Solid, assemble, box, frustum, hollow, ring, superquadric, turned
 

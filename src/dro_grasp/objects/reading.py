@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Num, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import reading
-from dro_grasp.geometry.mesh_files import check_bytes, open_mesh
+from dro_grasp.geometry.mesh_files import check_bytes, open_mesh, trimesh
 
 ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene | tuple[Any, Any] | Num[np.ndarray, "..."]
                 | Num[Tensor, "..."])

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import DENSITY, ObjectModel

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import nnls
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
@@ -142,6 +141,8 @@ def wrench_error(
     Forces obey friction, torsional too [m]; no contact presses with more than 1, all together press with at least 1. The error
     is the length of the remaining wrench, its torque about the mean of the points in metres of lever arm. Points as in `q1`.
     """
+    from scipy.optimize import nnls  # slow to load, and rarely wanted
+
     n = len(points)
     edges = np.zeros((6, 6))
     edges[0] = 1.0

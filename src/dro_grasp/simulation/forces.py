@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import linprog
-from scipy.sparse import block_diag, csr_matrix, hstack
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
@@ -120,6 +118,9 @@ def largest_payload(
 
     Amounts are scaled to a weight of 1 N per direction; then the largest share of an effort is least.
     """
+    from scipy.optimize import linprog  # slow to load, and rarely wanted
+    from scipy.sparse import block_diag, csr_matrix, hstack
+
     g, n, count = wrench.shape[1], len(effort), len(FORCES)
     if g == 0:
         return 0.0

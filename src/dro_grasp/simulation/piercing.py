@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.devices import cores
+from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
 from dro_grasp.simulation.scene import CACHED_SCENES, OBJECT_GROUP, TrialScene
 
 GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
@@ -63,22 +65,46 @@ def _in_place(
 
 @lru_cache(maxsize=CACHED_SCENES)
 def bones(scene: TrialScene) -> tuple[Bone, ...]:
-    """The axes of the fingers, from link to link."""
+    """The axes of the fingers, from link to link; seeking them takes longer than a trial, so they are cached on disk."""
     rest = _Rest(scene)
-    return tuple(bone for body in rest.bodies for own in rest.shapes[body] for before in rest.shapes.get(rest.parent(body), ())
-                 for bone in rest.between(body, before, own))
+    stored = cached_arrays(f"bones-{rest.key[:24]}", lambda: _packed(rest.bones()))
+    rows = zip(stored["body"].tolist(), stored["start"], stored["end"], stored["beyond"].tolist(), strict=True)
+    return tuple(Bone(*row) for row in rows)
+
+
+def _packed(found: Sequence[Bone]) -> Arrays:
+    """Bones as arrays."""
+    return {"body": np.array([bone.body for bone in found], int), "start": np.array([bone.start for bone in found]),
+            "end": np.array([bone.end for bone in found]), "beyond": np.array([bone.beyond for bone in found], float)}
 
 
 class _Rest:
     """The hand at rest, in which axes are sought."""
 
     def __init__(self, scene: TrialScene) -> None:
-        self.model = model = scene.model
+        self.model, self.hand_sha256 = scene.model, scene.hand.sha256
+        model = self.model
         self.data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.data)
         self.bodies = [b for b in range(1, model.nbody) if b != scene.object_body and model.body_mocapid[b] < 0]
         solid = (model.geom_contype | model.geom_conaffinity) > 0
         self.shapes = {b: [int(g) for g in np.nonzero((model.geom_bodyid == b) & solid)[0]] for b in self.bodies}
+
+    @property
+    def key(self) -> str:
+        """Hash of all that bones come from: the files behind the shapes, what the scene makes of them, and our own numbers."""
+        model, data = self.model, self.data
+        shapes = [shape for body in self.bodies for shape in self.shapes[body]]
+        return content_hash(
+            np.frombuffer(self.hand_sha256.encode(), np.uint8), np.array([GAP, DEEP, SPACING]), np.array(self.bodies),
+            model.body_parentid, model.body_jntadr, model.jnt_bodyid, model.jnt_type, data.xpos[self.bodies],
+            data.xmat[self.bodies], data.xaxis, data.xanchor, np.array(shapes), model.geom_bodyid[shapes],
+            model.geom_type[shapes], model.geom_size[shapes], data.geom_xpos[shapes], data.geom_xmat[shapes])
+
+    def bones(self) -> list[Bone]:
+        """The axes from each shape of a link to each of its parent's."""
+        return [bone for body in self.bodies for own in self.shapes[body]
+                for before in self.shapes.get(self.parent(body), ()) for bone in self.between(body, before, own)]
 
     def parent(self, body: int) -> int:
         return int(self.model.body_parentid[body])

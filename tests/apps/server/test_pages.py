@@ -76,6 +76,15 @@ def test_the_documents_request_is_one() -> None:
     assert (call.object.file.content, call.object.scale, call.table) == (b"solid", 0.001, 0.0)
 
 
+def test_the_command_line_has_a_page_of_its_own() -> None:
+    here = client()
+    reply = here("POST", "/generate", PLAIN | {"num": 2, "protocol": "none", "only_successful": True, "path": "/a/can.stl"})
+    assert reply.status == 200
+    call = reply.json()
+    assert (call["num"], call["protocol"], call["only_successful"], call["path"]) == (2, "none", True, "/a/can.stl")
+    assert here("POST", "/grasps", PLAIN | {"only_successful": True}).status == 422, "elsewhere it is no option"
+
+
 def test_a_request_is_answered_and_a_page_describes_it() -> None:
     here = client()
     reply = here("POST", "/grasps", PLAIN | {"num": 2})

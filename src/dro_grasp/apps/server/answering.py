@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import tempfile
 import time
@@ -18,13 +19,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.apps.library import Kind, Library, store_upload
-from dro_grasp.apps.server.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
+from dro_grasp.apps.report import NO_TRIAL, Asked, doubt, protocol_for, require_trial, told_of
+from dro_grasp.apps.server.messages import (
+    GenerateAnswer,
+    GenerateCall,
+    GraspAnswer,
+    SentCamera,
+    SentGrasp,
+    SentObject,
+    settings_in,
+)
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
-from dro_grasp.frames import is_name, motion_fault
+from dro_grasp.frames import NamedMotion, is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import REASON
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
+from dro_grasp.grasps.sources import hand_file, recorded
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
@@ -67,7 +78,9 @@ class Answerer:
         """
         self.library = Library()
         self._offer("object", [(Path(source).stem, source, source) for source in resolve_objects(list(config.objects))])
-        self._offer("hand", [((hand := load_hand(source)).name, source, hand) for source in dict.fromkeys(config.hands)])
+        hands = {source: load_hand(source) for source in config.hands}
+        self._offer("hand", [(hand.name, source, hand) for source, hand in hands.items()])
+        self.hand_files = {hand.name: hand_file(source) for source, hand in hands.items()}
         self.predictor = GraspPredictor(config.weights, config.device)
         self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
@@ -81,26 +94,24 @@ class Answerer:
                                   "of the files, or leave one out")
             self.library.add(kind, name, content)
 
-    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
-        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work."""
+    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer | GenerateAnswer:
+        """The answer to a GraspCall or GenerateCall; `progress` is called now and then, and what it raises ends the work."""
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
-        constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))
         if request.num * request.candidates > MAX_CANDIDATES:
             raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
                               f"most {MAX_CANDIDATES} candidates at once, `dro-grasp generate` more")
-        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        problem = self.problem(call)
+        if isinstance(call, GenerateCall):
+            return self._generated(call, problem, request, time.perf_counter() - begin, progress)
+        hand, obj = problem.hand, problem.obj
         if call.protocol is not None and obj.is_cloud:
             raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
-        obj = obj if call.mass is None else with_mass(obj, call.mass)
-        pair = hand.name, key, call.mass, constraints
-        if (problem := self.problems.get(pair)) is None:
-            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
         loaded = time.perf_counter() - begin
         made = self.predictor.run(problem, request, progress)
         middle = time.perf_counter()
         grasps = made.grasps if call.protocol is None else evaluate(problem, made.grasps, call.protocol, progress)
-        warning = constraints.warning(obj)
+        warning = problem.constraints.warning(obj)
         seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
         return GraspAnswer(
             id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
@@ -108,6 +119,43 @@ class Answerer:
             candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
             notes=[*obj.notes, *filter(None, [call.told, warning])], shortage=made.shortage,
             seconds={name: round(value, 4) for name, value in seconds.items()})
+
+    def _generated(
+        self, call: Any, problem: GraspProblem, request: GraspRequest, loaded: float, progress: Progress | None
+    ) -> GenerateAnswer:
+        """What `dro-grasp generate` tells and saves of the pair."""
+        hand, obj = problem.hand, problem.obj
+        if call.only_successful:
+            require_trial(obj, call.protocol)
+        if not obj.is_cloud:
+            obj.cut(progress)
+        made = self.predictor.run(problem, request, progress)
+        begin, protocol = time.perf_counter(), protocol_for(obj, call.protocol)
+        # The command's predictor records the file of an object that no camera saw, which has none here.
+        grasps = recorded(made.grasps, None, None if call.camera else call.path, call.object.scale)
+        grasps = grasps if protocol == NO_TRIAL else evaluate(problem, grasps, protocol, progress)
+        trial = time.perf_counter() - begin if bool(grasps.evaluated.any()) else 0.0
+        frame = "object" if call.camera is None else call.camera.frame
+        told = told_of(obj, made, grasps, Asked(
+            hand.name, request.num, request.seed, self.predictor.weights_name, protocol, frame))
+        odd = [doubt(problem.constraints, obj, call.camera is not None), made.shortage]
+        kept = grasps[grasps.success] if call.only_successful else grasps
+        camera = None if call.camera is None else NamedMotion(call.camera.frame, sent_pose(call.camera).float())
+        file = recorded(kept, self.hand_files.get(hand.name), call.path, call.object.scale, camera).to_bytes()
+        text = base64.b64encode(file).decode()
+        return GenerateAnswer(
+            **told._asdict(), file=text, kept=len(kept), seconds={"load": loaded, **made.seconds, "trial": trial},
+            warnings=[f"{obj.name}: {note}" for note in obj.notes] + [f"warning: {obj.name}: {why}" for why in odd if why])
+
+    def problem(self, call: Any) -> GraspProblem:
+        """The pair of a call, with its constraints; the last few are kept."""
+        constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))
+        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        obj = obj if call.mass is None else with_mass(obj, call.mass)
+        pair = hand.name, key, call.mass, constraints
+        if (problem := self.problems.get(pair)) is None:
+            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
+        return problem
 
     def hand_names(self) -> list[str]:
         """Names of the hands that can be asked for."""

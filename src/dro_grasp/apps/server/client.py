@@ -1,4 +1,4 @@
-"""Asking a grasp server from Python, with the standard library and NumPy alone."""
+"""Asking a grasp server from Python, with the standard library, and for points NumPy."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import json
 import time
 import uuid
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
-
-import numpy as np
-from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import given_path
 from dro_grasp.kinds import FORMER_CONSTRAINTS, checked, present
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+else:
+    ArrayLike = Any  # without NumPy, which names and files do without
 
 
 class GraspClient:
@@ -93,7 +95,7 @@ class GraspClient:
                 why = error.read().decode(errors="replace")
                 again = error.headers.get("Retry-After", "")
             raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}",
-                              float(again) if again.isdecimal() else None) from error
+                              float(again) if again.isdecimal() else None, error.code) from error
         except TimeoutError as error:
             raise ServerError(f"the grasp server at {self.url} gave no answer in {self.timeout:g} s; ask for fewer grasps, or "
                               "give GraspClient a longer timeout") from error
@@ -116,6 +118,8 @@ def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
     if isinstance(obj, str | Path):
         path = given_path(obj)
         return sent_file(path.name, path.read_bytes()) if path.is_file() else {"name": str(obj)}
+    import numpy as np
+
     try:
         points = np.asarray(obj if isinstance(obj, np.ndarray) else listed(obj))
     except ValueError:  # rows of several lengths

@@ -22,7 +22,7 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 from dro_grasp._version import __version__
 from dro_grasp.apps.origins import LOCAL, own_names, refusal, same_token
 from dro_grasp.apps.server.connections import Limits, within
-from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
+from dro_grasp.apps.server.messages import GenerateAnswer, GenerateCall, GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
 from dro_grasp.errors import OptionError, ServerError
 
@@ -130,6 +130,11 @@ def application(queue: RequestQueue, access: Access) -> FastAPI:
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]
         """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
+        return sent(await _answered(queue, call, request))
+
+    @app.post("/generate", response_model=GenerateAnswer, responses=told)
+    async def generate(call: GenerateCall, request: Request) -> Any:
+        """What `dro-grasp generate --server` tells and saves."""
         return sent(await _answered(queue, call, request))
 
     @app.delete("/grasps/{id}", responses={404: {"model": Refusal}})

@@ -166,6 +166,17 @@ GraspCall: Any = create_model(
     **fields_of(GraspRequest), **fields_of(Constraints))
 
 
+class GenerateCall(GraspCall):
+    """What `dro-grasp generate` asks of one object."""
+
+    protocol: str | None = None
+    """Protocol of the trials; `none` for no trial, null for what the command does by default."""
+    only_successful: bool = False
+    """Put successful grasps alone into the grasp file."""
+    path: str | None = None
+    """Where the object's file lies; the grasp file records it, and the server does not look there."""
+
+
 def settings_in(call: Any, settings: type[Settings], **loaded: Any) -> Settings:
     """The dataclass of a class whose fields a GraspCall holds, and those that were loaded from what it holds."""
     return settings(**{f.name: getattr(call, f.name) for f in fields(settings)} | loaded)  # type: ignore[arg-type]
@@ -229,6 +240,25 @@ class GraspAnswer(Message):
     """Why there are fewer grasps than were asked for; null if there are as many."""
     seconds: dict[str, float]
     """Time by part [s]."""
+
+
+class GenerateAnswer(Message):
+    """What `dro-grasp generate` tells and saves of one object."""
+
+    report: dict[str, Any]
+    """What the command prints with --json, without times and files of its own."""
+    rows: list[list[Any]]
+    """Rows of the table that it prints."""
+    lines: list[str]
+    """What it prints under the table."""
+    warnings: list[str]
+    """What it prints beside these."""
+    seconds: dict[str, float]
+    """Time by part [s]."""
+    file: str
+    """The grasp file, in base64."""
+    kept: int
+    """Number of grasps in it."""
 
 
 class Refusal(Message):

@@ -16,7 +16,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
@@ -470,6 +469,8 @@ class Linkage:
 
     def close(self, group: Group, q: Joints, held: Mapping[int, float]) -> Joints:
         """The joint values near some at which the loops of a group close and its springs rest, with some joints held."""
+        from scipy.optimize import least_squares  # slow to load, and few hands have loops
+
         free = [j for j in group.joints if j not in held and self.upper[j] - self.lower[j] > 1e-9]
         q = q.copy()
         q[list(held)] = list(held.values())

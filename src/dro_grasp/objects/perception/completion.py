@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -277,6 +276,8 @@ def extract_surface(
     side: VisibleSide, guesses: list[Guess], network: SurfaceNetwork
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Points on the network's zero level and their unit normals, in view axes; those of the best guess if there is none."""
+    from scipy.interpolate import RegularGridInterpolator  # with SciPy's optimisers: slow to load, and rarely wanted
+
     everything = np.concatenate([g.points for g in guesses])
     low, high = everything.min(0) - MARGIN, everything.max(0) + MARGIN
     spacing = float((np.prod(high - low) / CELLS) ** (1 / 3))

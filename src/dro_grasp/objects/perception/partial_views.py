@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.perception.completion import complete_cloud
