@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import mujoco
 import mujoco.batch
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.devices import cores
-from dro_grasp.simulation.scene import CACHED_SCENES, OBJECT_GROUP, TrialScene
+from dro_grasp.simulation.scene import OBJECT_GROUP, TrialScene
 
 GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
 DEEP = 0.0025  # How far inside the shapes an axis runs elsewhere, along any coordinate [m] (ours)
@@ -61,10 +60,12 @@ def _in_place(
     return places[:, bodies] + start, along
 
 
-@lru_cache(maxsize=CACHED_SCENES)
 def bones(scene: TrialScene) -> tuple[Bone, ...]:
-    """The axes of the fingers, from link to link."""
-    rest = _Rest(scene)
+    """The axes of the fingers, from link to link; found once for a hand, whose bodies come first in every scene."""
+    return scene.hand.kept("bones", lambda: _found(_Rest(scene)))
+
+
+def _found(rest: _Rest) -> tuple[Bone, ...]:
     return tuple(bone for body in rest.bodies for own in rest.shapes[body] for before in rest.shapes.get(rest.parent(body), ())
                  for bone in rest.between(body, before, own))
 
