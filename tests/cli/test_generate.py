@@ -121,7 +121,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     parts = sum(value for name, value in report["seconds"].items() if name != "total")
     assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
     assert (report["num"], report["protocol"]) == (3, "carry")
-    assert report["candidates"] >= 12  # four of the network for each, and those of the optimiser
+    assert report["candidates"] >= 8  # the fewest of the network, and those of the optimiser
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)
     assert len(grasps) == 3

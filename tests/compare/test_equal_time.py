@@ -129,6 +129,6 @@ def test_every_methods_candidates_are_finished_as_its_predictor_is_told(tmp_path
         method = Method("start", GraspPredictor(weights, config=PredictorConfig(finish=config)))
         made = finished_maker(problem, method, 2)(5, 1)
         expected = finish(problem, method.propose(problem, 5, 1), config, 2)
-        assert len(made) == (2 if config.settle is not None else 5)
+        assert len(made) == (3 if config.settle is not None else 5)
         assert torch.equal(made.score, expected.pool.score)
         assert torch.equal(made.joints, expected.pool.joints)

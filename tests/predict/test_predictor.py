@@ -17,7 +17,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.optimize.starts import Spread, wrist_rotations
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict import predictor as predictor_module
@@ -34,6 +36,7 @@ from dro_grasp.predict.sources.network import ProposalConfig, _placements
 from dro_grasp.predict.sources.optimiser import OptimiserConfig, OptimiserSource
 from dro_grasp.predict.sources.source import Candidates, Progress, Source
 from dro_grasp.predict.stages import scored
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights
 
@@ -290,6 +293,50 @@ def test_a_source_is_asked_again_for_what_was_rejected(weights: str, ball: Objec
         assert [num for num, _ in source.asked_for] == counts
         assert made.dropped == {PLANE: 2}
         assert (len(made.grasps), made.origin) == (2, ["listed"] * 2)
+
+
+class Starts(Source):
+    """Hands that face the object, and how many were asked for."""
+
+    name = "starts"
+
+    def __init__(self) -> None:
+        self.asked_for: list[tuple[int, int]] = []
+
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
+        self.asked_for.append((num, seed))
+        return palm_facing_starts(problem.hand, problem.obj, num, seed)
+
+
+@pytest.mark.parametrize(("trusted", "given", "counts"), [
+    (-math.inf, {}, [8]), (math.inf, {}, [8, 8]), (-math.inf, {"candidates": 6}, [12]), (-math.inf, {"candidates": 1}, [4]),
+    (-math.inf, {"refine": False}, [16]), (-math.inf, {"num": 1}, [4])])
+def test_no_more_candidates_are_made_once_enough_are_trusted(
+    weights: str, trusted: float, given: dict[str, Any], counts: list[int]
+) -> None:
+    source, hand, can = Starts(), loaded_hand("gripper3"), load_object("can")
+    config = PredictorConfig(
+        finish=FinishConfig(refine=RefineConfig(steps=2), weigh=None, least_confidence=0.0),
+        rescue=RescueConfig(trusted_scores=(trusted,)))
+    request = GraspRequest(**{"num": 4, "source": source} | given)
+    made = GraspPredictor(weights, config=config).run(GraspProblem(hand, can), request)
+    assert [num for num, _ in source.asked_for] == counts
+    assert len({seed for _, seed in source.asked_for}) == len(counts)
+    assert made.candidates == sum(counts)
+    assert len(made.grasps) == request.num
+
+
+def test_where_scores_do_not_tell_all_candidates_are_made_at_once(weights: str) -> None:
+    """Without a description nothing settles; of what was seen in part nothing is sure."""
+    hand, can = loaded_hand("gripper3"), load_object("can")
+    config = PredictorConfig(
+        finish=FinishConfig(refine=RefineConfig(steps=2), weigh=None, least_confidence=0.0),
+        rescue=RescueConfig(trusted_scores=(-math.inf,)))
+    bare = dataclasses.replace(hand, description=None)
+    for whose, obj in ((bare, can), (hand, partial_view(can, "half", 0))):
+        source = Starts()
+        GraspPredictor(weights, config=config).run(GraspProblem(whose, obj), GraspRequest(4, source=source))
+        assert [num for num, _ in source.asked_for] == [16]
 
 
 def test_a_source_that_has_no_more_does_not_return_the_same_grasp_twice(weights: str, ball: ObjectModel) -> None:

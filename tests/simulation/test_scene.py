@@ -16,6 +16,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
+from dro_grasp.simulation.piercing import bones
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, attach, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
@@ -123,6 +124,29 @@ def test_a_scene_is_built_once_for_a_pair_and_a_protocol(hand):
     for i in range(CACHED_SCENES):
         cached_scene(hand, ball(), replace(protocol("dro"), friction=0.5 + i / 100))
     assert cached_scene(hand, ball(), protocol("dro")) is not first  # the oldest has gone
+
+
+@pytest.mark.parametrize("table", [False, True])
+def test_what_was_found_of_the_hand_with_another_object_makes_the_same_scene(table: bool, monkeypatch: pytest.MonkeyPatch):
+    """Bit by bit, and without looking at the hand again."""
+    known, fresh = loaded_hand("barrett"), replace(loaded_hand("barrett"))
+    first = build_scene(known, ball(), protocol("strict"), table)
+    axes = bones(first)
+    new = build_scene(fresh, ball(0.02), protocol("carry"), table)
+    expected = saved(new), [(bone.body, bone.start.tolist(), bone.end.tolist(), bone.beyond) for bone in bones(new)]
+    monkeypatch.setattr("dro_grasp.simulation.scene._resting_contacts", None)
+    again = build_scene(known, ball(0.02), protocol("carry"), table)
+    assert saved(again) == expected[0] != saved(first)
+    assert [(bone.body, bone.start.tolist(), bone.end.tolist(), bone.beyond) for bone in bones(again)] == expected[1]
+    assert again.model.nexclude > 0
+    assert bones(again) is axes
+
+
+def saved(scene: TrialScene) -> bytes:
+    """All of a compiled model."""
+    buffer = np.zeros(mujoco.mj_sizeModel(scene.model), np.uint8)
+    mujoco.mj_saveModel(scene.model, None, buffer)
+    return buffer.tobytes()
 
 
 def test_objects_of_one_mesh_that_collide_otherwise_have_scenes_of_their_own(hand):

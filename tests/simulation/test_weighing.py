@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,7 @@ from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.simulation.grasp_state import WeightConfig
 from dro_grasp.simulation.payload import PayloadConfig
 from dro_grasp.simulation.protocols import CARRY
+from dro_grasp.simulation.rollout import ObjectState, Rollout
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
 from tests.helpers.claw import ball, claw, power_grasp
@@ -63,6 +65,25 @@ def test_weighing_says_what_trials_say(hand: Hand, obj: ObjectModel, grasps: Gra
     for guess in (0.05, 5.0):
         other = weigh(hand, obj, grasps.replace(payload=torch.full((3,), guess)), weight=NOTHING_ADDED, config=FINE)
         assert other.tolist() == pytest.approx(truth.tolist(), rel=0.3), "wherever the search begins"
+
+
+def test_what_has_gone_too_far_is_not_pulled_on(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pulled, pull = [], Rollout.pull
+
+    def noted(rollout: Rollout, rows: np.ndarray, force: np.ndarray, seconds: float, begin: object = None) -> ObjectState:
+        state = pull(rollout, rows, force, seconds, begin)
+        gone = state.shift(rollout.start.rows(rows)) >= CARRY.max_displacement
+        gone |= state.turn(rollout.start.rows(rows)) >= CARRY.max_rotation
+        pulled.append((begin is None, rows.tolist(), rows[~gone].tolist()))
+        return state
+
+    monkeypatch.setattr(Rollout, "pull", noted)
+    weigh(hand, obj, grasps.replace(payload=torch.tensor([0.05, 0.5, 5.0])), weight=NOTHING_ADDED, config=FINE)
+    firsts = [(left, len(rows)) for again, rows, left in pulled if not again]
+    assert [rows for again, rows, _ in pulled if again] == [left for left, _ in firsts if left]
+    assert 0 < sum(len(left) for left, _ in firsts) < sum(count for _, count in firsts)
 
 
 def test_company_and_unknown_payloads_change_nothing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:

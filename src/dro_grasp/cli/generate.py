@@ -39,7 +39,7 @@ class Generate:
     hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.
     object: str  # An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them.
     num: int = 16  # How many grasps of each object.
-    candidates: int = 4  # Candidates for each grasp; the best by score are kept. 1 is quickest.
+    candidates: int = 4  # Most candidates for each grasp; the best by score are kept. 1 is quickest.
     seed: int = 0  # The same seed gives the same grasps.
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
     """In the object's frame, or in the one that --camera names."""

@@ -25,7 +25,7 @@ class GraspRequest(Checked):
     seed: int = 0
     """The same seed gives the same grasps."""
     candidates: int = 4
-    """Candidates proposed for each grasp returned; the best by score are returned."""
+    """Most candidates proposed for each grasp returned, before rivals; the best by score are returned."""
     refine: bool = True
     """Refine and settle the candidates on the object's geometry before they are ranked."""
     temperature: float | None = None
@@ -61,14 +61,19 @@ class GraspRequest(Checked):
 
 @dataclass(frozen=True)
 class RetryConfig(Checked):
-    """How often a source is asked again when constraints reject its candidates (ours)."""
+    """How often a source is asked again when constraints reject its candidates, or too few are trusted (ours)."""
 
+    first: int = 2
+    """Candidates for each grasp that it is asked for at first, or half of those allowed if these are more, where candidates
+    settle: some two thirds of the better ones are then trusted, and without need of rivals nothing more is made."""
+    fewest: int = 8
+    """Fewest candidates that it is then asked for, where so many are allowed: fewer take nearly as long."""
     rounds: int = 4
     """Largest number of times that it is asked."""
     least_yield: float = 0.2
     """It is not asked again if no larger share of its candidates was admitted."""
     reserve: float = 1.5
-    """Factor on the number of candidates that the admitted share suggests for the next call."""
+    """Factor on the number of candidates that the admitted or trusted share suggests for the next call."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections import Counter
@@ -30,6 +31,7 @@ from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, Finished, finish_all
 from dro_grasp.predict.problem import GraspProblem, problems_of
+from dro_grasp.predict.settling import can_settle
 from dro_grasp.predict.shortage import shortage_in_words
 from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserSource
@@ -129,7 +131,7 @@ class GraspPredictor:
             touch_table: Whether fingertips may touch the table; None lets them beside what lies flat.
             margin: Multiple of the object's weight that the squeeze holds whichever way gravity pulls.
             max_force: Largest normal force of a contact at the squeeze [N].
-            candidates: Candidates for each grasp; the best by score are returned.
+            candidates: Most candidates for each grasp, before rivals; the best by score are returned.
             refine: Refine and settle the candidates before they are ranked.
             temperature: Spread of z: 0 for the likeliest grasps, 1 for the diversity of the training grasps; None takes the
                 predictor's.
@@ -274,6 +276,9 @@ class _Asking:
         self.problem, self.request, self.finishing = problem, request, config
         self.done: Finished | None = None
         self.alone = False
+        rescue = self.config.rescue
+        most = self.config.retry.rounds + max(len(rescue.trusted_scores), len(rescue.trusted_in_surroundings))
+        self.seeds = iter(_drawn(request.seed, most))
         self.made = Counter[str]()  # candidates by source
         self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
 
@@ -308,23 +313,46 @@ class _Asking:
                           self.seconds | done.watch.seconds, shortage)
 
     def until_enough(self, source: Source) -> Iterator[_Ask]:
-        """Candidates until as many as were asked for are admitted, as long as that is in sight."""
+        """Candidates until enough are trusted, or as many as were asked for are admitted, as long as that is in sight."""
         wanted, retry = self.request.num * self.request.candidates, self.config.retry
-        count, admitted = wanted, 0
-        for seed in (self.request.seed, *_drawn(self.request.seed, retry.rounds - 1)):
+        count, admitted = min(wanted, self._at_first()), 0
+        for seed in (self.request.seed, *itertools.islice(self.seeds, retry.rounds - 1)):
             yield _Ask(source, count, seed)
             done = self.done
             assert done is not None
             admitted += len(done.refined)
-            if admitted >= wanted or admitted <= retry.least_yield * done.made:
+            lacking = self._lacking_candidates(admitted)
+            if admitted >= wanted or admitted <= retry.least_yield * done.made or not lacking:
                 return
-            count = min(wanted, math.ceil(retry.reserve * (wanted - admitted) * done.made / admitted))
+            missing = min(wanted - admitted, lacking)
+            count = missing if admitted == done.made else min(wanted, math.ceil(retry.reserve * missing * done.made / admitted))
+
+    def _at_first(self) -> int:
+        """Candidates that are asked for at first, at most; all where their scores will not tell which to trust."""
+        num, whole, retry = self.request.num, self.request.num * self.request.candidates, self.config.retry
+        return max(retry.first * num, whole // 2, retry.fewest) if self._scores_tell else whole
+
+    @property
+    def _scores_tell(self) -> bool:
+        """Whether candidates settle and their scores then tell which hold: not of pinches, and no part of a cloud is sure."""
+        problem = self.problem
+        return (self.finishing.settle is not None and can_settle(problem) and not problem.lies_flat
+                and problem.obj.seen is None)
+
+    def _lacking_candidates(self, admitted: int) -> int:
+        """How many more candidates are likely to give what is lacking, from the trusted share of those admitted so far."""
+        num, retry = self.request.num, self.config.retry
+        if not self._scores_tell or self.done is None:
+            return num * self.request.candidates
+        lacking = self.done.lacking(self.config.rescue.rounds(self.problem.surroundings is not None)[0][0])
+        likely = retry.reserve * lacking * admitted / max(num - lacking, 1)
+        return max(retry.fewest, math.ceil(likely)) if lacking else 0
 
     def until_trusted(self, sources: Sequence[Source]) -> Iterator[_Ask]:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
         rescue, flat = self.config.rescue, self.problem.lies_flat
         levels, each = rescue.rounds(self.problem.surroundings is not None and not flat)
-        for k, (seed, least_score) in enumerate(zip(_drawn(self.request.seed, len(levels)), levels, strict=True)):
+        for k, (seed, least_score) in enumerate(zip(self.seeds, levels, strict=False)):
             lacking = self.request.num if self.done is None else self.done.lacking(least_score)
             if not lacking:
                 return

@@ -56,6 +56,8 @@ class SettleConfig(Checked):
 
     share: float = 0.5
     """Share of scored candidates that are settled, the best ones; the others are left out."""
+    spare: float = 1.5
+    """As many at least settle for each grasp that is wanted, since a third of them does not hold."""
     clearance_worth: float = 90.0
     """What the score of a grasp on an object seen in part loses for clearance that the opened hand lacks [log-odds per m]."""
     guess_offset: float = -2.8
@@ -132,7 +134,7 @@ def settle_best(
     Args:
         problem: Hand and object; see `can_settle`.
         grasps: Refined grasps with scores.
-        least: Settle as many at least, where there are.
+        least: Settle `spare` times as many at least, where there are.
         config: Which grasps settle, and what becomes of their scores.
         score: How grasps are scored.
         admission: What the constraints let pass.
@@ -159,7 +161,8 @@ def settle_best_all(
 def _better_share(problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig) -> Int[Tensor, " k"]:
     """Rows of the grasps that are settled."""
     # The score, which is learned from objects that hang in the air, does not tell which of several pinches lifts.
-    count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), min(len(grasps), least))
+    fewest = min(len(grasps), math.ceil(config.spare * least))
+    count = len(grasps) if problem.lies_flat else max(round(config.share * len(grasps)), fewest)
     return grasps.score.topk(count).indices.sort().values
 
 

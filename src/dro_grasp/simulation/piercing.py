@@ -10,7 +10,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import mujoco
 import mujoco.batch
@@ -19,7 +18,7 @@ from jaxtyping import Float
 
 from dro_grasp.devices import cores
 from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
-from dro_grasp.simulation.scene import CACHED_SCENES, OBJECT_GROUP, TrialScene
+from dro_grasp.simulation.scene import OBJECT_GROUP, TrialScene
 
 GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
 DEEP = 0.0025  # How far inside the shapes an axis runs elsewhere, along any coordinate [m] (ours)
@@ -63,10 +62,13 @@ def _in_place(
     return places[:, bodies] + start, along
 
 
-@lru_cache(maxsize=CACHED_SCENES)
 def bones(scene: TrialScene) -> tuple[Bone, ...]:
-    """The axes of the fingers, from link to link; seeking them takes longer than a trial, so they are cached on disk."""
-    rest = _Rest(scene)
+    """The axes of the fingers, from link to link; found once for a hand, whose bodies come first in every scene."""
+    return scene.hand.kept("bones", lambda: _stored(_Rest(scene)))
+
+
+def _stored(rest: _Rest) -> tuple[Bone, ...]:
+    """Axes from the disk, where they are cached: seeking them takes longer than a trial."""
     stored = cached_arrays(f"bones-{rest.key[:24]}", lambda: _packed(rest.bones()))
     rows = zip(stored["body"].tolist(), stored["start"], stored["end"], stored["beyond"].tolist(), strict=True)
     return tuple(Bone(*row) for row in rows)

@@ -238,7 +238,9 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = 
         _add_table(scene, protocol)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        _exclude_resting_contacts(scene, hand)
+        # They depend on the hand, and on whether there is a table, which stands still as the hand's root does.
+        for first, second in hand.kept(("resting contacts", table), lambda: _resting_contacts(scene, hand)):
+            scene.add_exclude(bodyname1=first, bodyname2=second)
         model = scene.compile()
     model.geom_group[:] = np.where(model.geom_bodyid == model.body("object").id, OBJECT_GROUP, 0)
     return TrialScene(model, hand, obj, protocol, table)
@@ -294,8 +296,8 @@ def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
     return protocol.mass_factor * (obj.mass if protocol.mass is None else protocol.mass)
 
 
-def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
-    """Exclude contacts of links that touch in the open hand, fingers side by side, and of each link with its parent."""
+def _resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> list[tuple[str, str]]:
+    """Links that touch in the open hand, fingers side by side, and each link with its parent: they do not collide."""
     # Fingers that cross must collide. MuJoCo's own parent-child filter ignores static parents.
     model = scene.compile()
     data = mujoco.MjData(model)
@@ -310,8 +312,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
         parent = int(model.body_parentid[body])
         if parent > 0 and model.body_weldid[parent] == 0:
             pairs |= {_named(model, body, other) for other in range(1, model.nbody) if model.body_weldid[other] == 0}
-    for first, second in sorted(p for p in pairs if p[0] != p[1] and "object" not in p):
-        scene.add_exclude(bodyname1=first, bodyname2=second)
+    return sorted(p for p in pairs if p[0] != p[1] and "object" not in p)
 
 
 def _named(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:

@@ -23,7 +23,7 @@ from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.payload import GRAVITY, Squeezes
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.rollout import Moment, Rollout, rollouts
+from dro_grasp.simulation.rollout import Moment, ObjectState, Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 
 LESS = 0.95  # Share of a mass that gave way, which its grasp may still carry (ours)
@@ -178,12 +178,24 @@ def _used(
     rollout: Rollout, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], begin: Moment, config: WeighingConfig
 ) -> Float[np.ndarray, " k"]:
     """Share of what the protocol lets an object move that a force [N] uses."""
-    rules, start = rollout.scene.protocol, rollout.start.rows(rows)
-    half = rollout.pull(rows, force, config.pulling / 2, begin)
-    now = rollout.pull(rows, force, config.pulling / 2)
-    share = config.going_on / (config.pulling / 2)
+    start, half = rollout.start.rows(rows), rollout.pull(rows, force, config.pulling / 2, begin)
+    used = _share(rollout, half, half.shift(start), half.turn(start))
+    going = np.flatnonzero(used < 1)  # what has gone too far already is not pulled on
+    if not len(going):
+        return used
+    before, now = half.rows(going), rollout.pull(rows[going], force[going], config.pulling / 2)
+    share, start = config.going_on / (config.pulling / 2), start.rows(going)
     moved, turned = (
-        after + share * np.maximum(after - before, 0)
-        for before, after in ((half.shift(start), now.shift(start)), (half.turn(start), now.turn(start))))
+        after + share * np.maximum(after - then, 0)
+        for then, after in ((before.shift(start), now.shift(start)), (before.turn(start), now.turn(start))))
+    used[going] = _share(rollout, now, moved, turned)
+    return used
+
+
+def _share(
+    rollout: Rollout, state: ObjectState, moved: Float[np.ndarray, " k"], turned: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Share of what the protocol lets an object move [m] and turn [rad]; NOT_HELD where the simulation is unsound."""
+    rules = rollout.scene.protocol
     used = np.maximum(moved / rules.max_displacement, turned / rules.max_rotation)
-    return np.where(now.stable & np.isfinite(used), used, NOT_HELD)
+    return np.where(state.stable & np.isfinite(used), used, NOT_HELD)
