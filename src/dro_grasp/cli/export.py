@@ -34,7 +34,7 @@ class Export:
     only_successful: Flag = False  # Export only grasps that passed their trial.
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object to use instead of the one named in the file, for a file with one object. Needed only to make pregrasps."""
+    """Object to use instead of the one named in the file, for a file with one object. Needed to make pregrasps, and for usd."""
     json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
@@ -90,10 +90,10 @@ class Export:
         hand = hand_of(grasps, self.hand) if needed or self.hand is not None else None
         if hand is not None:
             grasps.require_hand(hand)
-        if hand is not None and not stated:
-            centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
-            grasps = complete(hand, grasps, centre)
-        return ExportJob(grasps, frame, hand, *object_source(grasps))
+        obj = object_of(grasps, self.object, 1.0) if FORMATS[self.format].needs_object or not stated else None
+        if hand is not None and obj is not None and not stated:
+            grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=grasps.joints.dtype))
+        return ExportJob(grasps, frame, hand, *object_source(grasps), obj)
 
 
 def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:

@@ -299,10 +299,17 @@ def _moveit_file(job: ExportJob) -> bytes:
     return moveit_grasps(job.grasps, job.hand, job.frame).encode()
 
 
+def _usd_file(job: ExportJob) -> bytes:
+    from dro_grasp.grasps.export.usd import usd_file  # it needs an extra
+
+    return usd_file(job)
+
+
 WRITERS: dict[str, Callable[[ExportJob], bytes | list[bytes]]] = {
     "isaac_grasp": lambda job: isaac_grasp(job.grasps, job.frame, job.hand).encode(),
     "moveit": _moveit_file,
     "dexgraspbench": _dexgraspbench_files,
     "csv": lambda job: csv_table(job.grasps, job.frame, job.hand).encode(),
+    "usd": _usd_file,
 }
 """What makes one object's file, or one file per grasp, by the format's name."""
