@@ -168,6 +168,7 @@ MEASUREMENTS = {
     "gpu": Measurement("Times on a GPU", {
         "device": "python -m lab.benchmarks.device --quick --json",
         "trials": "python -m lab.benchmarks.device_trials --json",
-        "training": "python -m lab.benchmarks.training --device cuda --quick --json"}, wings=("training",), alone=True, device="cuda"),
+        "training": "python -m lab.benchmarks.training --device cuda --quick --json"}, wings=("training",), alone=True,
+        device="cuda"),
 }
 """Everything that README and docs tell, by name."""
