@@ -57,6 +57,14 @@ class Place:
 
 
 @dataclass(frozen=True)
+class Places:
+    """Where an object may be put."""
+
+    motions: list[Float[np.ndarray, "4 4"]]  # From where it stands, the most convenient first [m]
+    allowed: float  # How deep it may be in what carries it [m]
+
+
+@dataclass(frozen=True)
 class Fit:
     """Whether an object fits somewhere."""
 
@@ -71,7 +79,7 @@ def foot(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
 
 
 def standing_turn(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3 3"]:
-    """The least rotation after which a mesh stands stably on a level surface; none for a cloud, which stood when it was seen."""
+    """The least rotation after which a mesh stands stably on a level surface; none for a cloud, which stood as it was seen."""
     if obj.vertices is None:
         return np.eye(3)
     hull = trimesh.convex.convex_hull(obj.vertices)
@@ -100,14 +108,17 @@ class Placing:
         self._stand, self._foot = stand, foot(self._outline)
         self.now = foot(now)  # Where its foot is [m]
 
-    def motions(self) -> list[Float[np.ndarray, "4 4"]]:
-        """Motions of the object from where it stands to where it may be put, the most convenient first [m].
+    def places(self) -> Places:
+        """Where the object may be put.
 
         Raises:
             PlanError: It fits nowhere, there is no such surface, or the spot is off the table, out of reach, or in the air.
         """
-        if self.place.spot is not None:
-            return self._at(np.array(self.place.spot))
+        spot = self.place.spot
+        return Places(self._on_surface() if spot is None else self._at(np.array(spot)), self.allowed)
+
+    def _on_surface(self) -> list[Float[np.ndarray, "4 4"]]:
+        """Motions to spots that are chosen on a surface, or a PlanError."""
         found = list[Float[np.ndarray, "4 4"]]()
         for taken, spot in enumerate(self._chosen()):
             if taken == SPOTS:
@@ -207,7 +218,8 @@ class Placing:
     def allowed(self) -> float:
         """How deep the object may be in what carries it [m]: a cloud's cells reach beyond its points."""
         foot_in_ground = min(-self.cell.resting, 0.005)  # [m]: what stands deeper than this touches something else (ours)
-        return SINK + foot_in_ground + (VOXEL if any(thing.is_cloud for thing in self.cell.obstacles) and self._off_the_table else 0.0)
+        cells = self._off_the_table and any(thing.is_cloud for thing in self.cell.obstacles)
+        return SINK + foot_in_ground + (VOXEL if cells else 0.0)
 
     @property
     def _off_the_table(self) -> bool:
@@ -222,7 +234,8 @@ class Placing:
         base = self.cell.robot.T_world_base[:2, 3]
         (x, y), (now_x, now_y) = spot[:2] - base, self.now[:2] - base
         first = math.atan2(y, x) - math.atan2(now_y, now_x)
-        return [first + sign * 2 * math.pi * k / TURNS for k in range(TURNS // 2 + 1) for sign in ((1, -1) if k else (1,))][:TURNS]
+        steps = sorted(range(TURNS), key=lambda k: min(k, TURNS - k))
+        return [first + 2 * math.pi * k / TURNS for k in steps]
 
     def _motion(self, spot: Float[np.ndarray, "3"], yaw: float) -> Float[np.ndarray, "4 4"]:
         """How the object moves from where it stands to a spot."""

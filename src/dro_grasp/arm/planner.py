@@ -19,17 +19,8 @@ from torch import Tensor
 
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
-from dro_grasp.arm.placing import Place, Placing
-from dro_grasp.arm.reachability import (
-    Fault,
-    Feasible,
-    Places,
-    Postures,
-    Reachability,
-    ReachConfig,
-    carried,
-    reachable_directions,
-)
+from dro_grasp.arm.placing import Place, Places, Placing
+from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, carried, reachable_directions
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.trajectory import find_path, timed_stages
 from dro_grasp.arm.workcell import CARRIED, OBSTACLE, Workcell, moved, scene_solid, upright
@@ -229,8 +220,7 @@ class Task:
         """Where the object may be put."""
         if self.place is None:
             return None
-        placing = Placing(self.cell, self.place)
-        return Places(placing.motions(), placing.allowed)
+        return Placing(self.cell, self.place).places()
 
     @cached_property
     def rehearsal(self) -> Rehearsal | None:

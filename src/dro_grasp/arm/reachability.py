@@ -6,8 +6,8 @@ links. Grasps are asked for from there, and a wrist may be turned a little from 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.arm.placing import Places
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import CARRIED, VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
@@ -94,14 +95,6 @@ class Feasible:
     approach: Float[np.ndarray, "k n_arm"]  # From the standoff to the grasp [rad or m]
     lift: Float[np.ndarray, "m n_arm"]  # From the grasp upwards [rad or m]
     put: Put | None = None  # Where a place is asked for
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where an object may be put."""
-
-    motions: Sequence[Float[np.ndarray, "4 4"]] = field(default_factory=list)  # From where it stands, the best first [m]
-    allowed: float = 0.0  # How deep it may be in what carries it [m]
 
 
 @dataclass(frozen=True)
