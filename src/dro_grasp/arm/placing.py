@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from dro_grasp.arm.robot import Table
 from dro_grasp.arm.workcell import SINK, TABLE, VOXEL, Workcell
@@ -88,7 +89,9 @@ def standing_turn(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) ->
         return np.eye(3)
     downs = -poses[:, 2, :3] @ T_world_object[:3, :3].T  # what would be below, as the object is now
     nearest = downs[downs[:, 2].argmin()]
-    return trimesh.geometry.align_vectors(nearest, [0, 0, -1])[:3, :3]
+    axis = np.cross(nearest, (0.0, 0.0, -1.0))  # of length sin(angle)
+    sine, cosine = float(np.linalg.norm(axis)), -float(nearest[2])
+    return Rotation.from_rotvec(axis / max(sine, 1e-12) * math.atan2(sine, cosine)).as_matrix()
 
 
 class Placing:

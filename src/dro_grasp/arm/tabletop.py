@@ -173,12 +173,12 @@ class Attempt:
     """Time of one core from the depth image to the timed plan [s]; the other times are by the clock."""
     motion_seconds: float = 0.0
     """Duration of the planned motion [s]."""
-    place_error: float = float("nan")
-    """Distance of the placed object's centre of mass from where it should be [m]."""
-    place_tilt: float = float("nan")
-    """Angle between the placed object's upright and the one it had [degrees]."""
-    place_turn: float = float("nan")
-    """How far it is turned about the vertical from what was planned [degrees]."""
+    place_error: float | None = None
+    """Distance of the placed object's centre of mass from where it should be [m]; None if it was not placed."""
+    place_tilt: float | None = None
+    """Angle between the placed object's upright and the one it had [degrees], likewise."""
+    place_turn: float | None = None
+    """How far it is turned about the vertical from what was planned [degrees], likewise."""
     pushed: float = 0.0
     """Largest displacement of another object [m]."""
     robot_file: str = ""
@@ -251,7 +251,7 @@ def attempt(
     stage, reason = carry_out(scene, made, config, watch)
     if config.place and not reason:
         result = measured(result, scene, start, made)
-        stage, reason = place_fault(result)
+        stage, reason = place_fault(result.place_error or 0.0, result.place_tilt or 0.0)
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
     pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
@@ -323,15 +323,13 @@ def measured(result: Attempt, scene: LiftScene, start: Float[np.ndarray, "4 4"],
         place_turn=math.degrees(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
 
 
-def place_fault(result: Attempt) -> tuple[str, str]:
-    """Where an attempt with a place ended, and why if the object does not stand there."""
-    if result.place_tilt > FELL:
-        return "place", f"the object fell over: it is tilted by {result.place_tilt:.0f} degrees"
-    if result.place_tilt > PLACED_UPRIGHT:
-        return "place", f"the object stands tilted by {result.place_tilt:.0f} degrees"
-    if result.place_error > PLACED_WITHIN:
-        return "place", f"placed {100 * result.place_error:.1f} cm off"
-    return "done", ""
+def place_fault(error: float, tilt: float) -> tuple[str, str]:
+    """Where an attempt with a place ended, and why if the object does not stand there, so far off [m] and tilted [degrees]."""
+    if tilt > FELL:
+        return "place", f"the object fell over: it is tilted by {tilt:.0f} degrees"
+    if tilt > PLACED_UPRIGHT:
+        return "place", f"the object stands tilted by {tilt:.0f} degrees"
+    return ("place", f"placed {100 * error:.1f} cm off") if error > PLACED_WITHIN else ("done", "")
 
 
 def draw_place(
@@ -624,7 +622,7 @@ def lifted(attempts: Sequence[Attempt]) -> list[Attempt]:
 
 def placing_errors(attempts: Sequence[Attempt]) -> dict[str, float] | None:
     """Median errors of the placed objects [m and degrees], and the number placed; None if none was."""
-    rows = [(a.place_error, a.place_tilt) for a in attempts if math.isfinite(a.place_error)]
+    rows = [(a.place_error, a.place_tilt) for a in attempts if a.place_error is not None]
     if not rows:
         return None
     error, tilt = np.median(rows, axis=0).tolist()

@@ -320,7 +320,7 @@ class Tabletop:
 
 
 def _say(attempt: Attempt) -> None:
-    done = "held" if math.isnan(attempt.place_error) else "placed"
+    done = "held" if attempt.place_error is None else "placed"
     outcome = done if attempt.success else f"{attempt.stage}: {attempt.reason}"
     say_aside(f"{attempt.object}, attempt {attempt.number}: {outcome}")
 
