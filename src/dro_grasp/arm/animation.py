@@ -100,6 +100,7 @@ def _camera(robot: Robot, recorder: Recorder) -> Camera:
              for mesh in robot_meshes(robot, arm, hand)]
     places = np.stack([T[0, :3, 3] for _, _, T in recorder.frames])
     table = robot.table or Table()
-    around = places[:1, :2] + 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    corners = np.column_stack([around, np.full(4, table.height)])
+    square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # [m] (ours)
+    around = (places[[0, -1], None, :2] + square).reshape(-1, 2)
+    corners = np.column_stack([around, np.full(len(around), table.height)])
     return Camera.around(np.concatenate([*moved, places, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

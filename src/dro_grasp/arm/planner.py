@@ -19,10 +19,11 @@ from torch import Tensor
 
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
-from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
+from dro_grasp.arm.placing import Place, Places, Placing
+from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, carried, reachable_directions
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.trajectory import find_path, timed_stages
-from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
+from dro_grasp.arm.workcell import CARRIED, OBSTACLE, Workcell, moved, scene_solid, upright
 from dro_grasp.devices import Stopwatch, side_by_side
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
@@ -114,9 +115,9 @@ def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
-    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None, place: Sequence[float] | str | None = None,
 ) -> MotionPlan:
-    """A motion that grasps the object and lifts it.
+    """A motion that grasps the object and lifts it, and puts it down where that is asked for.
 
     Args:
         robot: Arm, hand and table. Without a table, the level plane below the object counts as one.
@@ -128,10 +129,13 @@ def plan(
         seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
         grasps: Complete grasps with scores, in the world's frame, instead of predicted ones; or what makes a batch from a seed.
         start: Where the arm's joints are when the motion begins [rad or m]; home by default. The hand is open.
+        place: Where to put it, and let it go: x, y, z of the middle of its foot in the world [m], and a turn about the vertical
+            [rad], any if that is left out; or "table" or the name of an obstacle, where a place is chosen. It stands there as
+            it stands now, or as its mesh stands stably.
 
     Raises:
-        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, or no
-            grasp can be carried out; the message counts what was dropped where.
+        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, the place is
+            impossible, or no grasp can be carried out; the message counts what was dropped where.
         RobotError: The robot collides with the table, or with itself, at the start.
         OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, the start is out of the joints' range, or
             the constraints leave nothing of the object.
@@ -140,7 +144,8 @@ def plan(
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start)
+    wanted = None if place is None else Place.of(place)
+    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted)
     task.check_start()
     tries = Tries()
     for batch, last in candidates(task, tries, grasps, predictor):
@@ -161,7 +166,7 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One object to lift."""
+    """One object to lift, and to put somewhere if a place is asked for."""
 
     cell: Workcell
     obj: ObjectModel  # With a frame whose z axis points up
@@ -170,11 +175,13 @@ class Task:
     constraints: Constraints  # Without obstacles, which the cell has
     seed: int
     start: Float[np.ndarray, " n_arm"]  # Of the arm [rad or m]
+    place: Place | None = None
 
     @staticmethod
     def of(
         robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+        place: Place | None = None,
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
         obj, T = upright(obj, T_world_object)
@@ -185,7 +192,7 @@ class Task:
             obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
         first = robot.home if start is None else robot.require_start(start)
         return Task(
-            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first)
+            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place)
 
     @property
     def robot(self) -> Robot:
@@ -206,7 +213,14 @@ class Task:
     @cached_property
     def reach(self) -> Reachability:
         """Inverse kinematics, with its own draws."""
-        return Reachability(self.cell, self.config.reach, self.seed)
+        return Reachability(self.cell, self.config.reach, self.seed, self.places)
+
+    @cached_property
+    def places(self) -> Places | None:
+        """Where the object may be put."""
+        if self.place is None:
+            return None
+        return Placing(self.cell, self.place).places()
 
     @cached_property
     def rehearsal(self) -> Rehearsal | None:
@@ -227,6 +241,7 @@ class Task:
             raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "
                             f"hand are long ({longest:.2f} m); give its place in the robot's world frame [m]")
         self.cell.refuse_contacts(self.start, "at home" if np.array_equal(self.start, self.robot.home) else "at the start")
+        _ = self.places  # refused before the work
 
     def advice(self, dropped: dict[str, int]) -> str:
         """What to change, by the reason for which most grasps were dropped."""
@@ -393,10 +408,14 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
             waypoints, reached = path
             goal = left.pop(reached)
             postures = Postures.of(robot, tries.grasps, goal.index)
+            with tries.watch("path"):
+                carry = None if goal.put is None else carry_path(task, goal, postures, seed)
             with tries.watch("timing"):
-                made = timed_stages(task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds)
+                made = timed_stages(
+                    task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds, carry,
+                ) if goal.put is None or carry is not None else None
             if made is not None:
-                notes, scene = _described(task, tries, goal.index, goals, left)
+                notes, scene = _described(task, tries, goal, goals, left)
                 return MotionPlan(notes, scene, *made)
             tries.dropped[goal.index] = Fault.NO_PATH
         elif not best:
@@ -405,10 +424,26 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
     return None
 
 
+def carry_path(task: Task, goal: Feasible, hand: Postures, seed: int) -> Float[np.ndarray, "k n_arm"] | None:
+    """Waypoints with the object in the hand, from the end of the lift to above its place; None if none is found."""
+    robot, cell = task.robot, task.cell
+    assert goal.put is not None
+    T_grasp = robot.T_world_wrist(goal.approach[-1])
+
+    def free(q: Float[np.ndarray, " n_arm"]) -> bool:
+        return cell.free(q, hand.squeeze, moved=carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=CARRIED)
+
+    if not free(goal.lift[-1]):
+        return None
+    found = find_path(goal.lift[-1], goal.put.lower[:1], free, *robot.working_range, task.config.planner_seconds, seed)
+    return None if found is None else found[0]
+
+
 def _described(
-    task: Task, tries: Tries, chosen: int, goals: list[Feasible], left: list[Feasible]
+    task: Task, tries: Tries, goal: Feasible, goals: list[Feasible], left: list[Feasible]
 ) -> tuple[PlanNotes, PlanScene]:
     """What a motion to the chosen goal was planned for, and how it came about."""
+    chosen = goal.index
     robot, obj, T, grasps, ready = task.robot, task.obj, task.T, tries.grasps, {goal.index for goal in left}
     clouds = [np.zeros((0, 3), np.float32), *(thing.cloud for thing in task.cell.obstacles)]
     wrists = grasps.T_object_wrist.double().numpy()
@@ -418,7 +453,7 @@ def _described(
         robot.name, obj.name, robot.arm_joints, robot.hand_joints, "world", task.height, len(grasps), tries.counts, len(goals),
         chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds,
         known(grasps.payload[chosen]), known(grasps.squeeze_force[chosen]),
-        None if effort is None else tuple(effort.double().tolist()))
+        None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist())
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
