@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,9 @@ import numpy as np
 import pytest
 import yaml
 
+import dro_grasp as dro
 from dro_grasp.arm.drivers import Drivers
+from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.robot import BUILTIN_ROBOTS, load_robot
 from dro_grasp.arm.robot_check import check_robot
 from dro_grasp.errors import RobotError
@@ -86,3 +91,33 @@ def test_usual_drivers_count_as_the_description_does() -> None:
     usual, q = Drivers.usual(3), np.array([0.1, -2.0, 0.0])
     assert usual.positions(q).tolist() == usual.rates(q).tolist() == q.tolist()
     assert usual.lines(("a", "b", "c")) == []
+
+
+def test_what_is_sent_is_in_the_drivers_numbers(planned: MotionPlan, tmp_path: Path) -> None:
+    names = (*planned.notes.arm_joints, *planned.notes.hand_joints)
+    count = len(planned.notes.arm_joints)
+    rng = np.random.default_rng(0)
+    zeros, scales = rng.uniform(-1, 1, len(names)), rng.uniform(0.5, 60, len(names)) * rng.choice([-1, 1], len(names))
+    torque = tuple(rng.uniform(-0.3, 0.3, len(names) - count).tolist())
+    notes = replace(planned.notes, zeros=tuple(zeros.tolist()), scales=tuple(scales.tolist()), squeeze_torque=torque)
+    replace(planned, notes=notes).save(tmp_path / "plan.npz")
+    other = MotionPlan.load(tmp_path / "plan.npz")
+    np.testing.assert_array_equal(other.arm.position, planned.arm.position)  # simulated and looked at as described
+
+    rows = list(csv.DictReader(io.StringIO(dro.trajectory_csv(other))))
+    both = np.concatenate([planned.arm.position, planned.hand.position], 1)
+    for i, name in enumerate(names):
+        column = f"{'arm' if i < count else 'hand'}/{name}"
+        found = np.array([float(row[column]) for row in rows])
+        np.testing.assert_allclose(found, scales[i] * (both[:, i] - zeros[i]), atol=1e-4)
+    last = list(other.points(50))[-1]
+    np.testing.assert_allclose(last.hand, scales[count:] * (planned.hand.position[-1] - zeros[count:]), atol=1e-9)
+    np.testing.assert_allclose(last.hand_effort, np.sign(scales[count:]) * torque, atol=1e-9)
+
+    text = dro.trajectory_yaml(other, efforts=True)
+    messages = yaml.safe_load(text)
+    assert "Joints in the drivers' numbers" in text.splitlines()[0]
+    middle = messages["arm"]["points"][len(rows) // 2]
+    np.testing.assert_allclose(middle["velocities"], scales[:count] * planned.arm.velocity[len(rows) // 2], atol=1e-4)
+    np.testing.assert_allclose(messages["squeeze"]["effort"], np.sign(scales[count:]) * torque, atol=1e-5)
+    np.testing.assert_allclose(messages["squeeze"]["position"], last.hand, atol=1e-4)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from dro_grasp.arm.drivers import Drivers
 from dro_grasp.arm.placing import foot
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
@@ -52,15 +53,20 @@ class Trajectory:
         """Duration [s]."""
         return float(self.time[-1])
 
+    def driven(self, drivers: Drivers) -> Trajectory:
+        """The same as drivers count it."""
+        return Trajectory(self.time, drivers.positions(self.position), drivers.rates(self.velocity),
+                          drivers.rates(self.acceleration))
+
 
 @dataclass(frozen=True)
 class MotionPoint:
-    """Where arm and hand should be at one time."""
+    """Where arm and hand should be at one time, as the drivers count it."""
 
     time: float  # Since the start [s]
     stage: str  # One of ALL_STAGES
-    arm: Float[np.ndarray, " n_arm"]  # [rad or m]
-    hand: Float[np.ndarray, " n_dof"]  # [rad or m]
+    arm: Float[np.ndarray, " n_arm"]  # [rad or m, unless the robot file states other units]
+    hand: Float[np.ndarray, " n_dof"]  # Likewise
     hand_effort: Float[np.ndarray, " n_dof"] | None = None  # [Nm or N]; None if the plan knows none
 
 
@@ -88,6 +94,10 @@ class PlanNotes:
     """Efforts of the hand's independent joints at the squeeze [Nm or N], positive toward larger values; None if unknown."""
     place: list[list[float]] | None = None
     """Motion of the object, 4x4 in the world [m], from where it stood to where it is put; None if it is only lifted."""
+    zeros: tuple[float, ...] | None = None
+    """See `Drivers`, of arm and hand; None where drivers count as the description does."""
+    scales: tuple[float, ...] | None = None
+    """Likewise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +142,15 @@ class MotionPlan:
         """The hand's joints while it holds the object [rad or m]."""
         return self.hand.position[self.part("lift")][-1]
 
+    @property
+    def drivers(self) -> tuple[Drivers, Drivers]:
+        """How the drivers of the arm and of the hand count joints."""
+        notes, count = self.notes, len(self.notes.arm_joints)
+        both = Drivers.usual(count + len(notes.hand_joints))
+        if notes.zeros is not None and notes.scales is not None:
+            both = Drivers(notes.zeros, notes.scales)
+        return both.part(slice(None, count)), both.part(slice(count, None))
+
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
         first, end = (int(np.searchsorted(self.stage, ALL_STAGES.index(stage), side)) for side in ("left", "right"))
@@ -155,9 +174,10 @@ class MotionPlan:
         return share[:, None] * np.array(self.notes.squeeze_torque)
 
     def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
-        """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""
-        effort = self.hand_effort
-        columns = [self.arm.position, self.hand.position, *([] if effort is None else [effort])]
+        """Targets at a rate [1/s], the last one included, as drivers count joints: for a loop that sends them to a robot."""
+        effort, (of_arm, of_hand) = self.hand_effort, self.drivers
+        columns = [of_arm.positions(self.arm.position), of_hand.positions(self.hand.position)]
+        columns += [] if effort is None else [of_hand.efforts(effort)]
         count = int(np.ceil(self.seconds * rate - 1e-9))
         for time in [*(i / rate for i in range(count)), self.seconds]:
             row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
@@ -209,8 +229,8 @@ class MotionPlan:
                 raise PlanError(f"{path} is a plan file of another version; plan again")
             time, stage, *rows = (file[name] for name in COLUMNS)
             scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
-            lists = ["arm_joints", "hand_joints", *(["squeeze_torque"] if header.get("squeeze_torque") is not None else [])]
-            for name in lists:
+            lists = [name for name in ("squeeze_torque", "zeros", "scales") if header.get(name) is not None]
+            for name in ("arm_joints", "hand_joints", *lists):
                 header[name] = tuple(header[name])
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
@@ -239,28 +259,32 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
             add them to what they command. A joint_trajectory_controller without one refuses them.
     """
     notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in plan.stages}
-    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm),
-                "hand": _message(notes.frame, notes.hand_joints, plan.hand, plan.hand_effort if efforts else None)}
+    (of_arm, of_hand), effort = plan.drivers, plan.hand_effort if efforts else None
+    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm.driven(of_arm)),
+                "hand": _message(notes.frame, notes.hand_joints, plan.hand.driven(of_hand),
+                                 None if effort is None else of_hand.efforts(effort))}
     told = forces_in_words(notes.payload, notes.squeeze_force)
     if notes.squeeze_torque is not None:
         messages["squeeze"] = {
-            "header": _header(notes.frame), "name": list(notes.hand_joints), "position": _plain(plan.squeeze),
-            "velocity": [], "effort": _plain(np.array(notes.squeeze_torque))}
+            "header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
+            "position": _plain(of_hand.positions(plan.squeeze)),
+            "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
+    units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
     does = "lifts" if notes.place is None else "lifts and places"
-    return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in rad or m, efforts in Nm or N, time in s.\n"
+    return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
 
 
 def trajectory_csv(plan: MotionPlan) -> str:
     """One row for each sample: time, stage, and the target of every joint, arm before hand, then known efforts of the hand."""
-    text, effort = io.StringIO(), plan.hand_effort
+    text, effort, (of_arm, of_hand) = io.StringIO(), plan.hand_effort, plan.drivers
     table = csv.writer(text, lineterminator="\n")
     joints = [f"arm/{n}" for n in plan.notes.arm_joints] + [f"hand/{n}" for n in plan.notes.hand_joints]
-    columns = [plan.arm.position, plan.hand.position]
+    columns = [of_arm.positions(plan.arm.position), of_hand.positions(plan.hand.position)]
     if effort is not None:
         joints += [f"effort/{n}" for n in plan.notes.hand_joints]
-        columns.append(effort)
+        columns.append(of_hand.efforts(effort))
     table.writerow(["time", "stage", *joints])
     for i, time in enumerate(plan.arm.time.tolist()):
         values = _plain(np.concatenate([column[i] for column in columns]))

@@ -453,7 +453,9 @@ def _described(
         robot.name, obj.name, robot.arm_joints, robot.hand_joints, "world", task.height, len(grasps), tries.counts, len(goals),
         chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds,
         known(grasps.payload[chosen]), known(grasps.squeeze_force[chosen]),
-        None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist())
+        None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
+        zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
+        scales=None if robot.drivers.are_usual else robot.drivers.scales)
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
