@@ -15,6 +15,7 @@ from .arm.tabletop import (
     TabletopRun as TabletopRun,
     run_tabletop as run_tabletop,
 )
+from .arm.task_stages import task_stages as task_stages, task_yaml as task_yaml
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval
 from .errors import DroGraspError as DroGraspError

@@ -81,6 +81,8 @@ class Plan:
     efforts: Flag = False
     """Write efforts into the hand's points of --trajectory, for controllers with an effort interface; others refuse them."""
     csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
+    stages: Annotated[Path | None, optional("YAML", "not written")] = None
+    """The task as stages of MoveIt Task Constructor, which plans the motions between them anew."""
     json: Flag = False  # Print one JSON object instead of text.
 
     def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
@@ -107,7 +109,7 @@ class Plan:
         for option, place in (("--at", self.at), ("--near", self.near)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
-        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
+        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv"), (self.stages, ".yaml")):
             if path is not None:
                 check_output(path, ending)
         if self.place is not None and self.place_on is not None:
@@ -134,7 +136,7 @@ class Plan:
         made = (make or plan)(
             robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start,
             place=self.place or self.place_on)
-        written = self._write(made)
+        written = self._write(made, robot)
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
             return 0
@@ -142,21 +144,24 @@ class Plan:
             say(line)
         return 0
 
-    def _write(self, made: MotionPlan) -> dict[str, str]:
+    def _write(self, made: MotionPlan, robot: Robot) -> dict[str, str]:
         """Write the files that were asked for; returns their paths."""
         from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.arm.task_stages import task_yaml
         from dro_grasp.files import replacing
 
         if self.efforts and made.notes.squeeze_torque is None:
             say_aside("warning: the efforts of the grasp are unknown, so the hand's points have none; close with a low limit")
         if self.output is not None:
             made.save(self.output)
-        texts = (self.trajectory, lambda: trajectory_yaml(made, self.efforts)), (self.csv, lambda: trajectory_csv(made))
-        for path, text in texts:
+        texts: tuple[tuple[str, Path | None, Callable[[], str]], ...] = (
+            ("trajectory", self.trajectory, lambda: trajectory_yaml(made, self.efforts)),
+            ("csv", self.csv, lambda: trajectory_csv(made)), ("stages", self.stages, lambda: task_yaml(made, robot)))
+        for what, path, text in texts:
             if path is not None:
-                with replacing(path, "trajectory") as temporary:
+                with replacing(path, what) as temporary:
                     temporary.write_text(text(), encoding="utf-8")
-        return {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
+        return {what: str(path) for what, path, *_ in (("plan", self.output), *texts) if path}
 
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
         """The object with what stands around it, and where its frame is in the world."""
