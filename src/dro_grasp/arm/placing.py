@@ -37,6 +37,7 @@ class Place:
     spot: tuple[float, float, float] | None = None  # Where the middle of the object's foot comes to stand [m]
     yaw: float | None = None  # By how much it is turned about the vertical [rad]; None for any
     surface: str = TABLE  # Name of what it is put on, where no spot is given
+    falls: float = 0.0  # How far it may fall from the spot, as into a bin [m]
 
     @staticmethod
     def of(given: Sequence[float] | str) -> Place:
@@ -145,7 +146,7 @@ class Placing:
         if not found:
             raise PlanError(f"something stands at {where}: '{self._name}' would be {100 * nearest.depth:.1f} cm deep in "
                             f"{nearest.thing}; give a place farther away from it")
-        if self._beside(self._motion(spot - (0, 0, GAP), self._yaw(found[0]))).depth == 0.0:
+        if self._beside(self._motion(spot - (0, 0, GAP + self.place.falls), self._yaw(found[0]))).depth == 0.0:
             self._refuse_air(spot, where)
         return found
 

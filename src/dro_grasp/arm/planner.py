@@ -115,7 +115,8 @@ def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
-    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None, place: Sequence[float] | str | None = None,
+    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+    place: Sequence[float] | str | Place | None = None,
 ) -> MotionPlan:
     """A motion that grasps the object and lifts it, and puts it down where that is asked for.
 
@@ -144,7 +145,7 @@ def plan(
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    wanted = None if place is None else Place.of(place)
+    wanted = place if place is None or isinstance(place, Place) else Place.of(place)
     task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted)
     task.check_start()
     tries = Tries()

@@ -145,8 +145,8 @@ def _lifting(
         cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
     if not free:
         return None
-    return [(reach, _still(hand.opened, reach)), (_still(standoff, shape), shape), (approach, _still(hand.pregrasp, approach)),
-            (_still(grasp, close), close), (lift, _still(hand.squeeze, lift))]
+    return [(reach, still(hand.opened, reach)), (still(standoff, shape), shape), (approach, still(hand.pregrasp, approach)),
+            (still(grasp, close), close), (lift, still(hand.squeeze, lift))]
 
 
 def _placing(
@@ -179,15 +179,15 @@ def _placing(
         cell.free(end, posture, 0.0, put.moved, kept=put.kept) for posture in opening.position)
     if not free:
         return None
-    retreat = joined([back, _still(end, opening)]), joined([_still(put.released, back), opening])
-    return [(carry, _still(hand.squeeze, carry)), (lower, _still(hand.squeeze, lower)), (_still(place, release), release),
+    retreat = joined([back, still(end, opening)]), joined([still(put.released, back), opening])
+    return [(carry, still(hand.squeeze, carry)), (lower, still(hand.squeeze, lower)), (still(place, release), release),
             retreat]
 
 
-def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
+def still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
     """No motion at the times of another trajectory."""
-    still = np.zeros((len(other.time), len(q)))
-    return Trajectory(other.time, np.tile(q, (len(still), 1)), still, still)
+    rest = np.zeros((len(other.time), len(q)))
+    return Trajectory(other.time, np.tile(q, (len(rest), 1)), rest, rest)
 
 
 def smooth(
