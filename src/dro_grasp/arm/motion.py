@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
 from dro_grasp.grasps.forces import forces_in_words
+from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldCheck, HoldExpectation, check_hold
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -80,6 +82,8 @@ class PlanNotes:
     squeeze_force: float | None = None  # Sum of the normal forces at the squeeze [N], likewise
     squeeze_torque: tuple[float, ...] | None = None
     """Efforts of the hand's independent joints at the squeeze [Nm or N], positive toward larger values; None if unknown."""
+    hold: dict[str, tuple[float, ...]] | None = None
+    """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +117,23 @@ class MotionPlan:
     def seconds(self) -> float:
         """Duration [s]."""
         return self.arm.seconds
+
+    @property
+    def hold(self) -> HoldExpectation | None:
+        """Joints and efforts to expect after the lift, with the object in the hand and without; None in plans of before."""
+        known = self.notes.hold
+        return None if known is None else HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS))
+
+    def check_hold(self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None) -> HoldCheck:
+        """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
+
+        Raises:
+            OptionError: Measurements have another shape, or are not finite.
+            PlanError: The plan was made before plans stated what to expect.
+        """
+        if (expected := self.hold) is None:
+            raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
+        return check_hold(expected, measured_joints, measured_efforts)
 
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
@@ -189,6 +210,8 @@ class MotionPlan:
             lists = ["arm_joints", "hand_joints", *(["squeeze_torque"] if header.get("squeeze_torque") is not None else [])]
             for name in lists:
                 header[name] = tuple(header[name])
+            if (hold := header.get("hold")) is not None:
+                header["hold"] = {name: tuple(row) for name, row in hold.items()}
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
 
@@ -202,7 +225,8 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
 def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
     """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces.
 
-    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints.
+    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints. `held` and
+    `empty` state what to expect after the lift, with the object in the hand and without.
 
     Args:
         plan: What is written.
@@ -217,6 +241,11 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
         messages["squeeze"] = {
             "header": _header(notes.frame), "name": list(notes.hand_joints), "position": _plain(plan.hand.position[-1]),
             "velocity": [], "effort": _plain(np.array(notes.squeeze_torque))}
+    if (hold := plan.hold) is not None:
+        for name, joints, effort in (("held", hold.held_joints, hold.held_efforts),
+                                     ("empty", hold.empty_joints, hold.empty_efforts)):
+            messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "position": _plain(joints),
+                              "velocity": [], "effort": _plain(effort)}
     return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
