@@ -23,7 +23,7 @@ HOLD_COLUMNS = ("held_joints", "held_torque", "empty_joints", "empty_torque", "h
 """Further columns of a batch: joints [rad or m] and efforts [Nm or N] with the object in the hand and without, and what counts
 as a radian to each joint: 1, or a length where it slides [m]."""
 HoldState = Literal["held", "empty", "slipping"]
-STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")
+STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")  # In the order of HoldConfig.priors
 STEPS = 10  # Shares of the way that are tried for a slipping object (ours)
 
 
@@ -121,9 +121,9 @@ def check_hold(
         total = total + _log_likelihoods(efforts, expected.held_efforts, expected.empty_efforts, noise, None, config)
     slipping = logsumexp(total[2:]) - math.log(len(total) - 2)
     odds = np.array([total[0], total[1], slipping]) + np.log(config.priors)
-    chances = dict(zip(STATES, np.exp(odds - logsumexp(odds)).tolist(), strict=True))
-    state = max(STATES, key=lambda name: chances[name])
-    return HoldCheck(state, chances[state], chances)
+    chances = np.exp(odds - logsumexp(odds)).tolist()
+    best = max(range(len(STATES)), key=chances.__getitem__)
+    return HoldCheck(STATES[best], chances[best], dict(zip(STATES, chances, strict=True)))
 
 
 def _measured(name: str, given: ArrayLike, size: int) -> Float[np.ndarray, " n_dof"]:

@@ -247,7 +247,7 @@ def _jittered(
 
     Noise of depth was measured on planes and has what shifts add there, so that only edges are shifted.
     """
-    row, column = np.indices(view.depth.shape)
+    row, column = (np.asarray(at) for at in np.indices(view.depth.shape))
     head_on, slant = noise.lateral
     if max(head_on, slant) == 0:
         return row, column
@@ -257,7 +257,7 @@ def _jittered(
     to_row, to_column = (np.clip(at + shift, 0, size - 1) for at, shift, size in
                          zip((row, column), shifts, view.depth.shape, strict=True))
     reach = 2 * math.ceil(3 * head_on * scale) + 3
-    moved = maximum_filter(edge, reach) & (_off_plane(view, (row, column), (to_row, to_column)) > JUMP)
+    moved = np.asarray(maximum_filter(edge, reach), bool) & (_off_plane(view, (row, column), (to_row, to_column)) > JUMP)
     return np.where(moved, to_row, row), np.where(moved, to_column, column)
 
 
