@@ -27,6 +27,12 @@ from .grasps.export.writers import (
     isaac_grasp as isaac_grasp,
     moveit_grasps as moveit_grasps,
 )
+from .grasps.hold import (
+    HoldCheck as HoldCheck,
+    HoldConfig as HoldConfig,
+    HoldExpectation as HoldExpectation,
+    check_hold as check_hold,
+)
 from .hands.check import HandReport as HandReport, check_hand as check_hand
 from .hands.hand import Hand as Hand
 from .hands.library import hand_names as hand_names, load_hand as load_hand
@@ -64,6 +70,7 @@ from .predict.sources.variation import VariationConfig as VariationConfig
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .simulation.contacts import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from .simulation.forces import GraspForces as GraspForces, find_forces as find_forces
+from .simulation.holding import expect_hold as expect_hold
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate

@@ -6,7 +6,7 @@ What is there is what the camera sees. From one look to the next, nothing is kep
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -17,7 +17,7 @@ from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.table_scene import PickedObject, pick_object, sort_out
+from dro_grasp.arm.table_scene import pick_object, sort_out
 from dro_grasp.arm.trajectory import find_path, smooth, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError

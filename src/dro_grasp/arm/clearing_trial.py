@@ -16,6 +16,7 @@ from dro_grasp.arm.tabletop import Region, TabletopConfig, Watcher, depth_image,
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked
+from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
@@ -29,7 +30,7 @@ class ClearTrialConfig(Checked):
 
     region: Region = TabletopConfig.region
     """Area where things are put, as in `TabletopConfig`."""
-    noise: float = TabletopConfig.noise
+    noise: float | NoiseName = TabletopConfig.noise
     """Noise of the camera's depth, likewise."""
     clear: ClearConfig = field(default_factory=ClearConfig)
     """How it is cleared."""
@@ -56,7 +57,7 @@ class ClearTrial:
 class SimulatedRig:
     """A robot and a camera in MuJoCo."""
 
-    def __init__(self, scene: LiftScene, noise: float, seed: int, watch: Watcher | None = None) -> None:
+    def __init__(self, scene: LiftScene, noise: float | NoiseName, seed: int, watch: Watcher | None = None) -> None:
         """Move the scene's robot; noise and seed are those of its camera."""
         self.scene, self._noise, self._seed, self._watch, self._looks = scene, noise, seed, watch, 0
 

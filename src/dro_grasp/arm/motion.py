@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from dro_grasp.arm.drivers import Drivers
 from dro_grasp.arm.placing import foot
@@ -20,6 +21,7 @@ from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
 from dro_grasp.grasps.forces import forces_in_words
+from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldCheck, HoldExpectation, check_hold
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -98,6 +100,8 @@ class PlanNotes:
     """See `Drivers`, of arm and hand; None where drivers count as the description does."""
     scales: tuple[float, ...] | None = None
     """Likewise."""
+    hold: dict[str, tuple[float, ...]] | None = None
+    """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +154,23 @@ class MotionPlan:
         if notes.zeros is not None and notes.scales is not None:
             both = Drivers(notes.zeros, notes.scales)
         return both.part(slice(None, count)), both.part(slice(count, None))
+
+    @property
+    def hold(self) -> HoldExpectation | None:
+        """Joints and efforts to expect after the lift, with the object in the hand and without; None in plans of before."""
+        known = self.notes.hold
+        return None if known is None else HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS))
+
+    def check_hold(self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None) -> HoldCheck:
+        """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
+
+        Raises:
+            OptionError: Measurements have another shape, or are not finite.
+            PlanError: The plan was made before plans stated what to expect.
+        """
+        if (expected := self.hold) is None:
+            raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
+        return check_hold(expected, measured_joints, measured_efforts)
 
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
@@ -232,6 +253,8 @@ class MotionPlan:
             lists = [name for name in ("squeeze_torque", "zeros", "scales") if header.get(name) is not None]
             for name in ("arm_joints", "hand_joints", *lists):
                 header[name] = tuple(header[name])
+            if (hold := header.get("hold")) is not None:
+                header["hold"] = {name: tuple(row) for name, row in hold.items()}
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
 
@@ -251,7 +274,8 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
 def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
     """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces.
 
-    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints.
+    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints. `held` and
+    `empty` state what to expect after the lift, with the object in the hand and without.
 
     Args:
         plan: What is written.
@@ -269,6 +293,11 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
             "header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
             "position": _plain(of_hand.positions(plan.squeeze)),
             "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
+    if (hold := plan.hold) is not None:
+        for name, joints, forces in (("held", hold.held_joints, hold.held_efforts),
+                                     ("empty", hold.empty_joints, hold.empty_efforts)):
+            messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
+                              "position": _plain(of_hand.positions(joints)), "effort": _plain(of_hand.efforts(forces))}
     units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
     does = "lifts" if notes.place is None else "lifts and places"
     return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"

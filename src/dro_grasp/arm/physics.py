@@ -72,7 +72,7 @@ class LiftScene:
         Fixtures stand where they are, in the world's frame; they are not among the objects.
         """
         robot = self.robot = cell.robot
-        self.objects = tuple(objects)
+        self.objects, self.fixtures = tuple(objects), tuple(fixtures)
         scene = robot_spec(robot, LIFT_PROTOCOL, robot.table)
         scene.memory = MEMORY
         for body in list(scene.bodies)[1:]:

@@ -31,6 +31,7 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
+from dro_grasp.grasps.hold import HOLD_COLUMNS
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
@@ -42,6 +43,7 @@ from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
+from dro_grasp.simulation.holding import expect_hold
 
 Directions = Literal["paper", "all"]  # Palm directions that are asked for
 ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
@@ -211,6 +213,10 @@ class Task:
         middle = self.T[:2, :3] @ self.obj.cloud.mean(0) + self.T[:2, 3]
         return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
 
+    def at_object(self, grasps: GraspBatch) -> GraspBatch:
+        """Grasps in the world, in the object's frame."""
+        return grasps.replace(T_object_wrist=torch.from_numpy(np.linalg.inv(self.T)).float() @ grasps.T_object_wrist)
+
     @cached_property
     def reach(self) -> Reachability:
         """Inverse kinematics, with its own draws."""
@@ -277,7 +283,7 @@ class Tries:
     lost: list[Feasible] = field(default_factory=list)  # Can be carried out, but lose the object when rehearsed
     dropped: dict[int, str] = field(default_factory=dict)  # Why
     shortage: str = ""  # Why a batch had no grasp at all
-    watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
+    watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing", "hold"))
 
     @property
     def grasps(self) -> GraspBatch:
@@ -328,10 +334,8 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     tries.parts.append(grasps)
     with tries.watch("reach"):
         if task.constraints != Constraints():  # table and obstacles are the arm's affair
-            T = np.linalg.inv(task.T)
-            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
-            there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
-            for reason, wrong in violations(problem, there).items():
+            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(np.linalg.inv(task.T)))
+            for reason, wrong in violations(problem, task.at_object(grasps)).items():
                 for row in wrong.nonzero()[:, 0].tolist():
                     tries.dropped.setdefault(first + row, reason)
         for row, reason in task.reach.hopeless(grasps).items():
@@ -416,7 +420,9 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
                     task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds, carry,
                 ) if goal.put is None or carry is not None else None
             if made is not None:
-                notes, scene = _described(task, tries, goal, goals, left)
+                with tries.watch("hold"):
+                    expected = expect_hold(robot.hand, task.obj, task.at_object(tries.grasps[[goal.index]]))
+                notes, scene = _described(task, tries, goal, goals, left, expected)
                 return MotionPlan(notes, scene, *made)
             tries.dropped[goal.index] = Fault.NO_PATH
         elif not best:
@@ -441,7 +447,7 @@ def carry_path(task: Task, goal: Feasible, hand: Postures, seed: int) -> Float[n
 
 
 def _described(
-    task: Task, tries: Tries, goal: Feasible, goals: list[Feasible], left: list[Feasible]
+    task: Task, tries: Tries, goal: Feasible, goals: list[Feasible], left: list[Feasible], expected: GraspBatch
 ) -> tuple[PlanNotes, PlanScene]:
     """What a motion to the chosen goal was planned for, and how it came about."""
     chosen = goal.index
@@ -456,7 +462,8 @@ def _described(
         known(grasps.payload[chosen]), known(grasps.squeeze_force[chosen]),
         None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
-        scales=None if robot.drivers.are_usual else robot.drivers.scales)
+        scales=None if robot.drivers.are_usual else robot.drivers.scales,
+        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS})
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

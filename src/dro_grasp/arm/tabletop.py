@@ -42,6 +42,7 @@ from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.depth_noise import DepthView, NoiseName, depth_noise, measured_depth
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
@@ -55,6 +56,7 @@ PLACED_WITHIN = 0.02  # Largest distance from its place of an object that is pla
 PLACED_UPRIGHT = 15.0  # Largest tilt of it [degrees], likewise
 FELL = 45.0  # Tilt from which on it is said to have fallen over [degrees] (ours)
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
+REFLECTANCES = (0.1, 0.9)  # Shares of the light that things return, the table among them [1] (ours)
 STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
 
 Region = tuple[float, float, float, float]  # Least x and y, greatest x and y, from the arm's base [m]
@@ -66,8 +68,8 @@ class TabletopConfig(Checked):
 
     see: Literal["cloud", "mesh"] = "cloud"
     """What the planner is given: the cloud of the robot's camera, or, as a control, the true mesh at its true place."""
-    noise: float = 0.0015
-    """Standard deviation of depth [m]."""
+    noise: float | NoiseName = "stereo"
+    """Noise of the camera's depth: that of a kind of camera, or a standard deviation alike for all pixels [m]."""
     region: Region = (0.38, -0.18, 0.58, 0.18)
     """Area where objects are put: least x and y, greatest x and y, from the arm's base [m]."""
     clutter: int = 0
@@ -98,8 +100,7 @@ class TabletopConfig(Checked):
         if wanted.obstacles is not None or wanted.contact_region or wanted.keep_out:
             raise OptionError("objects of attempts come to rest anywhere, so that obstacles, contact_region and keep_out say "
                               "nothing there; leave them out, or use dro_grasp.plan for one object in its place")
-        if not 0 <= self.noise < math.inf:
-            raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
+        depth_noise(self.noise)
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
@@ -407,12 +408,12 @@ def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:
 
 
 def depth_image(
-    scene: LiftScene, camera: CameraMount, noise: float, seed: int
+    scene: LiftScene, camera: CameraMount, noise: float | str, seed: int
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Depth along the camera's z axis [m], and which pixels show the scene's first object.
 
     Depth is zero where nothing is near, and where the robot's model covers the view. Objects are seen as their true meshes.
-    `noise` is the standard deviation of depth [m].
+    `noise` is a preset of `depth_noise`, or the standard deviation of depth [m]. Things are dark or bright by chance.
     """
     row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
@@ -421,16 +422,20 @@ def depth_image(
     world = (rays / length[:, None]) @ camera.T_world_camera[:3, :3].T
     groups = np.array([1, 1, 1, 0, 1, 0], np.uint8)  # true shapes in, convex parts out
     assert groups[SHAPE_GROUP]
-    geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    geom, distance, normal = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0), np.zeros(rays.size)
     eye = camera.T_world_camera[:3, 3].copy()
     mujoco.mj_multiRay(
-        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), 3.0)
+        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, normal, len(rays), 3.0)
     owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
     robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
     seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]
     first = np.array([name == object_name(0) for name in owner])[np.maximum(geom, 0)] & seen
-    drawn = np.random.default_rng(seed).normal(0.0, noise, len(rays))
-    return np.where(seen, distance / length + drawn, 0.0).reshape(row.shape), first.reshape(row.shape)
+    light = np.random.default_rng([seed, 1]).uniform(*REFLECTANCES, scene.model.ngeom)[geom]
+    view = DepthView(
+        np.where(seen, distance / length, 0.0).reshape(row.shape),
+        (normal.reshape(-1, 3) @ camera.T_world_camera[:3, :3]).reshape(*row.shape, 3), thinned_intrinsics(camera),
+        light.reshape(row.shape))
+    return measured_depth(view, depth_noise(noise), seed), first.reshape(row.shape)
 
 
 def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:

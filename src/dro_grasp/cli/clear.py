@@ -12,7 +12,7 @@ from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.arm.clearing import Pick
-    from dro_grasp.arm.clearing_trial import ClearTrial, ClearTrialConfig
+    from dro_grasp.arm.clearing_trial import ClearTrialConfig
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Clear:
         names = resolve_objects(list(self.objects))
         count = len(names) if self.things is None else self.things
         if self.tables < 1 or not 1 <= count <= len(names):
-            raise OptionError(f"{self.tables} tables of {count} things are asked for, of {len(names)} objects; give at least one "
-                              "table, and no more things than objects")
+            raise OptionError(f"{self.tables} tables of {count} things are asked for, of {len(names)} objects; give at least "
+                              "one table, and no more things than objects")
         config, robot = self._config(), load_robot(self.robot)
         key = {"robot": robot.sha256, "objects": [load_object(name).sha256 for name in names], "things": count,
                "seed": self.seed, "weights": describe_weights(self.weights)["sha256"], "settings": asdict(config)}
@@ -78,7 +78,7 @@ class Clear:
                 known[number] = asdict(made)
                 _append(self.output, {"table": number, **asdict(made), "key": key})
                 if recorder is not None and self.video is not None:
-                    draw_animation(robot, recorder, self.video, [config.clear.bin])
+                    draw_animation(robot, recorder, self.video)
                     say_aside(f"video: {self.video}")
             done.append(known[number])
         self._report(done)

@@ -249,7 +249,8 @@ class Tabletop:
     """Number of other built-in objects that stand around the one to grasp: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
     """How the object's points are separated from others: by distance (cluster), or by the true mask."""
-    noise: float = 0.0015  # Standard deviation of the camera's depth [m].
+    noise: float | Literal["none", "structured_light", "time_of_flight", "stereo"] = "stereo"
+    """Noise of the camera's depth: that of a kind of camera, or a standard deviation alike for all pixels [m]."""
     seed: int = 0  # Seed of all draws.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
