@@ -53,7 +53,8 @@ class Bin(Checked):
 
     def holds(self, points: Float[np.ndarray, "n 3"], around: float = 0.0) -> Bool[np.ndarray, " n"]:
         """Which points are above it, or at most so far beside it [m], as seen from above."""
-        return (np.abs(points[:, :2] - self.centre) < np.array(self.size) / 2 + around).all(1)
+        inside: Bool[np.ndarray, "n 2"] = np.abs(points[:, :2] - self.centre) < np.array(self.size) / 2 + around
+        return inside[:, 0] & inside[:, 1]
 
     def walls(self, table: float) -> ObjectModel:
         """Its walls on a table of this height [m], in the world's frame."""
@@ -67,7 +68,9 @@ class Bin(Checked):
             box.apply_translation(place)
             boxes.append(box)
         parts = tuple((np.asarray(box.vertices, np.float64), np.asarray(box.faces, np.int64)) for box in boxes)
-        return mesh_object("bin", trimesh.util.concatenate(boxes), origin="the bin", parts=parts)
+        corners, sides = (np.concatenate(own) for own in zip(*((v, f + 8 * i) for i, (v, f) in enumerate(parts)), strict=True))
+        whole = trimesh.Trimesh(corners, sides)
+        return mesh_object("bin", whole, origin="the bin", parts=parts)
 
 
 @dataclass(frozen=True)
@@ -164,17 +167,18 @@ def clear(
     picks, failed = list[Pick](), list[Pick]()
     while len(picks) < config.most:
         points, places = _things(robot, rig, config.bin)
-        left = [place for place in places if len(_near(failed, place)) < config.tries]
+        left = sorted((place for place in places if len(_near(failed, place)) < config.tries),
+                      key=lambda place: len(_near(failed, place)))  # the rest of the order is that of places
         if not left:
             return Cleared(tuple(picks), tuple(_near(failed, place)[-1] for place in places))
-        for place in left:
+        for place in left:  # until something moves, and what was seen is no longer true
             pick = _pick(robot, rig, points, place, predictor, config, seed + len(picks), judged)
             picks.append(pick)
             failed += [pick] if pick.reason else []
             if progress is not None:
                 progress(pick)
             if pick.stage not in ("see", "plan") or len(picks) == config.most:
-                break  # something has moved: look again
+                break
     return Cleared(tuple(picks), tuple(failed))
 
 

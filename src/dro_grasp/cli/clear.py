@@ -28,7 +28,8 @@ class Clear:
     objects: tuple[str, ...]  # Names or files of meshes, or groups such as builtin:train, of which each table is drawn.
     things: Annotated[int | None, optional("INT", "all")] = None  # How many stand on a table.
     tables: int = 1  # How many tables are cleared.
-    bin: Annotated[tuple[float, float, float, float, float] | None, optional("X Y LX LY HEIGHT", "0.3 0.5 0.36 0.3 0.08")] = None
+    bin: Annotated[
+        tuple[float, float, float, float, float] | None, optional("X Y LX LY HEIGHT", "0.3 0.5 0.36 0.3 0.08")] = None
     """Middle and extents of the bin, and the height of its walls, in the world [m]."""
     tries: int = 3  # Picks of a thing that may fail before it is given up.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
