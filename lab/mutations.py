@@ -87,7 +87,7 @@ FAULTS = (
     Fault("objects/shape.py", "mass, *solid)", "mass)", "cached scenes do not know an object's convex parts: a stale key"),
     Fault("objects/perception/scan.py", "normals @ R.T\n", "normals @ R\n",
           "normals of a scan turned the wrong way into the wanted frame"),
-    Fault("objects/perception/partial_views.py", "camera.noise * (depth / 0.5) ** 2", "camera.noise * (depth / 0.5)",
+    Fault("objects/perception/partial_views.py", "camera.noise * (hits.depth / 0.5) ** 2", "camera.noise * (hits.depth / 0.5)",
           "noise of a depth camera grows with depth, not with its square"),
     Fault("network/checkpoints.py", "if digest != shipped:", 'if shipped == "none":', "hash of shipped weights unchecked"),
     Fault("network/latent.py", "middle = z + 0.5 * step *", "middle = z + step *", "midpoint rule of the flow without its 0.5"),

@@ -15,6 +15,7 @@ from .arm.tabletop import (
     TabletopRun as TabletopRun,
     run_tabletop as run_tabletop,
 )
+from .arm.task_stages import task_stages as task_stages, task_yaml as task_yaml
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval
 from .errors import DroGraspError as DroGraspError
@@ -25,6 +26,12 @@ from .grasps.export.writers import (
     dexgraspbench as dexgraspbench,
     isaac_grasp as isaac_grasp,
     moveit_grasps as moveit_grasps,
+)
+from .grasps.hold import (
+    HoldCheck as HoldCheck,
+    HoldConfig as HoldConfig,
+    HoldExpectation as HoldExpectation,
+    check_hold as check_hold,
 )
 from .hands.check import HandReport as HandReport, check_hand as check_hand
 from .hands.hand import Hand as Hand
@@ -63,6 +70,7 @@ from .predict.sources.variation import VariationConfig as VariationConfig
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .simulation.contacts import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from .simulation.forces import GraspForces as GraspForces, find_forces as find_forces
+from .simulation.holding import expect_hold as expect_hold
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate

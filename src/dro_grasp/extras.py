@@ -8,10 +8,10 @@ from dro_grasp.errors import OptionError
 
 EXTRAS = {
     "apps": ("viser", "fastapi", "uvicorn", "cachetools"), "arm": ("mink", "daqp", "ompl", "toppra"), "ray": ("ray",),
-    "gpu": ("warp", "mujoco_warp"), "tensorboard": ("tensorboard",),
+    "gpu": ("warp", "mujoco_warp"), "tensorboard": ("tensorboard",), "usd": ("pxr",),
 }
 """What an extra installs: pages in the browser and the grasp server; kinematics, its solver, motion planning and timing;
-workers on clusters; simulation on a GPU; curves of training."""
+workers on clusters; simulation on a GPU; curves of training; USD stages."""
 
 
 def require_extra(name: str) -> None:

@@ -30,6 +30,7 @@ from dro_grasp.arm.tabletop import (
     thinned_intrinsics,
 )
 from dro_grasp.arm.workcell import Workcell
+from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import solid_of
 
@@ -79,6 +80,28 @@ def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: Li
     distance = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs()
     assert float(distance.median()) < 0.0015
     assert float(distance.quantile(0.95)) < 0.005
+
+
+@pytest.mark.parametrize("name", ["structured_light", "time_of_flight", "stereo"])
+def test_the_table_has_the_noise_of_a_kind_of_camera(scene: LiftScene, robot: dro.Robot, name: NoiseName) -> None:
+    camera = robot.camera
+    assert camera is not None
+    (true, mask), T = depth_image(scene, camera, 0.0, 0), camera.T_world_camera
+    table = (true > 0) & ~mask
+    rays = depth_points(np.ones(true.shape), thinned_intrinsics(camera)).reshape(*true.shape, 3)
+    cosine = np.abs(rays @ T[2, :3]) / np.linalg.norm(rays, axis=-1)
+    there, error = np.zeros(true.shape, int), []
+    for seed in range(3):
+        depth, again = depth_image(scene, camera, name, seed)
+        assert np.array_equal(again, mask)
+        near = table & (depth > 0) & (np.abs(depth - true) < 0.02)
+        there += near
+        error.append(((depth - true) / PRESETS[name].deviation(np.maximum(true, 0.1), np.arccos(cosine)))[near])
+    assert np.concatenate(error).std() == pytest.approx(1.0, abs=0.1)
+    assert (there[table] > 0).mean() > 0.9
+    sight = sort_out(depth_points(depth, thinned_intrinsics(camera)), T, robot.table)
+    assert abs(sight.table_height) < 1e-3
+    assert len(sight.points) == pytest.approx(int(mask.sum()), rel=0.25)
 
 
 def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: LiftScene, robot: dro.Robot) -> None:

@@ -142,7 +142,7 @@ def test_plans_keep_their_forces_and_those_without_say_nothing(
     again = MotionPlan.load(tmp_path / "plan.npz")
     assert again.notes == pressing.notes
     np.testing.assert_allclose(again.hand_effort, pressing.hand_effort, atol=1e-6)
-    silent = replace(planned, notes=replace(planned.notes, payload=None, squeeze_force=None, squeeze_torque=None))
+    silent = replace(planned, notes=replace(planned.notes, payload=None, squeeze_force=None, squeeze_torque=None, hold=None))
     assert silent.hand_effort is None
     assert next(silent.points()).hand_effort is None
     messages = yaml.load(dro.trajectory_yaml(silent, efforts=True), yaml.CSafeLoader)
@@ -154,10 +154,34 @@ def test_plans_keep_their_forces_and_those_without_say_nothing(
     with np.load(tmp_path / "silent.npz") as file:
         arrays = dict(file)
     header = json.loads(str(arrays["header"]))
-    for name in ("payload", "squeeze_force", "squeeze_torque"):  # a plan file from before there were any
+    for name in ("payload", "squeeze_force", "squeeze_torque", "hold"):  # a plan file from before there were any
         assert header.pop(name) is None
     np.savez(tmp_path / "old.npz", **arrays | {"header": np.array(json.dumps(header))})
     assert MotionPlan.load(tmp_path / "old.npz").notes == silent.notes
+
+
+def test_a_plan_says_what_to_expect_of_the_hold_and_checks_it(planned: MotionPlan, tmp_path: Path) -> None:
+    expected = planned.hold
+    assert expected is not None
+    moving = np.abs(expected.empty_joints - expected.held_joints).max()
+    assert moving > 0.02, "fingers go on where there is no can"
+    assert np.linalg.norm(expected.held_efforts) > np.linalg.norm(expected.empty_efforts), "fingers meet each other, too"
+    np.testing.assert_allclose(expected.empty_joints, planned.hand.position[-1], atol=0.15)
+    assert planned.check_hold(expected.held_joints, expected.held_efforts).state == "held"
+    assert planned.check_hold(expected.empty_joints, expected.empty_efforts).state == "empty"
+    planned.save(tmp_path / "plan.npz")
+    again = MotionPlan.load(tmp_path / "plan.npz")
+    assert again.notes == planned.notes
+    messages = yaml.load(dro.trajectory_yaml(planned), yaml.CSafeLoader)
+    for name, joints, efforts in (("held", expected.held_joints, expected.held_efforts),
+                                  ("empty", expected.empty_joints, expected.empty_efforts)):
+        assert messages[name]["name"] == list(planned.notes.hand_joints)
+        np.testing.assert_allclose(messages[name]["position"], joints, atol=1e-6)
+        np.testing.assert_allclose(messages[name]["effort"], efforts, atol=1e-6)
+    before = replace(planned, notes=replace(planned.notes, hold=None))
+    assert before.hold is None
+    with pytest.raises(dro.DroGraspError, match="plan again"):
+        before.check_hold(expected.held_joints)
 
 
 def test_a_plan_file_in_which_a_stage_has_no_rows_is_read(planned: MotionPlan) -> None:

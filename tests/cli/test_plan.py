@@ -42,10 +42,10 @@ def planned(asked: dict[str, Any], small_robot: str, monkeypatch: pytest.MonkeyP
     made = dro.MotionPlan(NOTES, scene, np.array([0, 0, 1, 2, 3, 4]), still, still)
 
     def plan(
-        robot: Any, obj: Any, T: Any, obstacles: Any, predictor: Any, config: Any, seed: int, start: Any
+        robot: Any, obj: Any, T: Any, obstacles: Any, predictor: Any, config: Any, seed: int, start: Any, place: Any
     ) -> dro.MotionPlan:
-        asked.update(
-            robot=robot, obj=obj, T=T, obstacles=obstacles, predictor=predictor, config=config, seed=seed, start=start)
+        asked.update(robot=robot, obj=obj, T=T, obstacles=obstacles, predictor=predictor, config=config, seed=seed, start=start,
+                     place=place)
         return made
 
     return lambda *options: parse(["plan", "--robot", small_robot, "--object", "can", *options]).run(plan)
@@ -66,7 +66,7 @@ def test_every_option_reaches_the_planner_and_every_file_is_written(
     assert asked["config"] == dro.PlanConfig(
         9, 2, constraints=constraints, rehearsals=4, planner_seconds=2.5, least_confidence=0.35)
     assert (asked["seed"], asked["predictor"].weights_name) == (7, dro.load_weights(weights).name)
-    assert asked["start"] == (0.1, -0.2, 3.0)
+    assert (asked["start"], asked["place"]) == ((0.1, -0.2, 3.0), None)
     assert (asked["obj"].name, [o.name for o in asked["obstacles"]]) == ("can", ["cube"])
     stands = np.asarray(asked["obj"].vertices) @ asked["T"][:3, :3].T + asked["T"][:3, 3]
     assert stands[:, 2].min() == pytest.approx(asked["robot"].table.height, abs=1e-3)
@@ -101,6 +101,13 @@ def test_efforts_that_are_unknown_are_told(planned: Planned, capsys: pytest.Capt
     assert "warning: the efforts of the grasp are unknown" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("options", "place"), [
+    (["--place", "0.4", "-0.2", "0", "1.5"], (0.4, -0.2, 0.0, 1.5)), (["--place-on", "table"], "table")])
+def test_a_place_reaches_the_planner(options: list[str], place: object, planned: Planned, asked: dict[str, Any]) -> None:
+    assert planned(*options) == 0
+    assert asked["place"] == place
+
+
 def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     planned: Planned, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -123,6 +130,8 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     (["--least-confidence", "nan"], "least_confidence is nan"),
     (["--mass", "-1"], "mass is -1.0; give kilograms, above 0"),
     (["--efforts"], "--efforts are written into the trajectory file; name one with --trajectory YAML"),
+    (["--place", "0.5", "0.1"], "give X Y Z of the object's foot in metres"),
+    (["--place", "0.5", "0.1", "0", "--place-on", "table"], "--place and --place-on both say where to put the object"),
     (["--camera", "robot"], "has no camera; state it in the robot file, or give --camera JSON"),
 ])
 def test_what_cannot_be_planned_is_refused_before_the_work(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,26 @@ def test_people_see_objects_rates_and_every_attempt_aside(
     assert lifted("--output", "results.parquet") == 0
     assert len(done) == 4, "they are not repeated"
     assert capsys.readouterr().err == ""
+
+
+def test_those_that_are_placed_are_counted_among_those_that_are_lifted(
+    small_robot: str, weights: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def attempt(robot: Any, obj: Any, number: int, seed: int, *others: Any) -> Attempt:
+        made = Attempt(robot.name, obj.name, number, seed, others[1].label(), processor_seconds=1.0)
+        return [replace(made, stage="lift", reason="it fell"), replace(made, stage="carry", reason="it slipped"),
+                replace(made, stage="place", reason="placed 3.1 cm off", place_error=0.031, place_tilt=4.0),
+                replace(made, stage="done", success=True, place_error=0.005, place_tilt=2.0)][number]
+
+    common = ["tabletop", "--robot", small_robot, "--objects", "can", "--attempts", "4", "--weights", weights, "--place"]
+    output = ["--output", str(tmp_path / "results.parquet")]
+    assert parse([*common, *output]).run(attempt) == 0
+    said = capsys.readouterr()
+    assert "1 of 3 that were lifted are placed (33%, 95 % interval 6% to 79%); median 18 mm and 3 degrees off" in said.out
+    assert "can, attempt 3: placed" in said.err
+    assert parse([*common, *output, "--json"]).run(attempt) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["lifted"], told["placing_errors"]) == (3, {"error": pytest.approx(0.018), "tilt": 3.0, "n": 2})
 
 
 @pytest.mark.parametrize(("options", "said"), [

@@ -21,12 +21,14 @@ from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, render
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import object_meshes
 from dro_grasp.predict.predictor import GraspPredictor
 
 FORMATS = {".gif": "GIF", ".webp": "WEBP"}  # Endings of animation files
 RATE = 10  # Frames per second (ours)
 SIZE = (480, 360)  # Width and height [pixels]
 VIEW = (0.9, -1.25, 0.75)  # Direction from the robot towards the camera, in the world
+FIXTURE_COLOUR: Colour = (0.55, 0.60, 0.68)  # Grey blue of what does not move
 OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)  # Green of other objects on the table
 
 
@@ -38,6 +40,7 @@ class Recorder(Watcher):
     frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
         default_factory=list)  # Arm, hand [rad or m], and the objects' poses [m]
     objects: tuple[ObjectModel, ...] = ()  # The objects in the scene, the one that is asked for first
+    fixtures: tuple[ObjectModel, ...] = ()  # What does not move, in the world
     plan: MotionPlan | None = None
     next_time: float | None = None  # Simulated time of the next frame [s]
 
@@ -48,7 +51,7 @@ class Recorder(Watcher):
     def moved(self, scene: LiftScene) -> None:
         """Look at the scene."""
         if self.next_time is None or scene.data.time >= self.next_time:
-            self.objects = scene.objects
+            self.objects, self.fixtures = scene.objects, scene.fixtures
             self.frames.append((*scene.joints(), np.stack([scene.pose(i) for i in range(len(scene.objects))])))
             self.next_time = scene.data.time + 1 / self.rate - scene.model.opt.timestep / 2
 
@@ -63,7 +66,8 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
     if not recorder.frames:
         raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
     camera = _camera(robot, recorder)
-    pictures = [Image.fromarray(_frame(robot, recorder.objects, camera, *frame)) for frame in recorder.frames]
+    still = [Mesh(mesh.vertices, mesh.faces, FIXTURE_COLOUR) for thing in recorder.fixtures for mesh in object_meshes(thing)]
+    pictures = [Image.fromarray(_frame(robot, recorder.objects, still, camera, *frame)) for frame in recorder.frames]
     lengths = [1000 // RATE] * (len(pictures) - 1) + [1000]
     kind = FORMATS[path.suffix.lower()]
     options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
@@ -82,7 +86,7 @@ def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
 
 
 def _frame(
-    robot: Robot, objects: Sequence[ObjectModel], camera: Camera, arm: Float[np.ndarray, " n_arm"],
+    robot: Robot, objects: Sequence[ObjectModel], still: Sequence[Mesh], camera: Camera, arm: Float[np.ndarray, " n_arm"],
     hand: Float[np.ndarray, " n_dof"], poses: Float[np.ndarray, "o 4 4"],
 ) -> UInt8[np.ndarray, "height width 3"]:
     things = []
@@ -91,7 +95,7 @@ def _frame(
         assert obj.faces is not None
         colour = OTHER_COLOUR if i else OBJECT_COLOUR
         things.append(Mesh(obj.vertices @ T[:3, :3].T + T[:3, 3], obj.faces, colour))
-    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), *things], camera, *SIZE)
+    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), *still, *things], camera, *SIZE)
 
 
 def _camera(robot: Robot, recorder: Recorder) -> Camera:
@@ -100,6 +104,7 @@ def _camera(robot: Robot, recorder: Recorder) -> Camera:
              for mesh in robot_meshes(robot, arm, hand)]
     places = np.stack([T[0, :3, 3] for _, _, T in recorder.frames])
     table = robot.table or Table()
-    around = places[:1, :2] + 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    corners = np.column_stack([around, np.full(4, table.height)])
+    square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # [m] (ours)
+    around = (places[[0, -1], None, :2] + square).reshape(-1, 2)
+    corners = np.column_stack([around, np.full(len(around), table.height)])
     return Camera.around(np.concatenate([*moved, places, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

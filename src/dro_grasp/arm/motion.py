@@ -1,10 +1,11 @@
-"""A motion of arm and hand, from home to the lifted object: in memory, as a plan file, and as trajectories for controllers."""
+"""A motion of arm and hand, from home to the lifted or placed object: in memory, as plan file, as controllers' trajectories."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,15 +13,23 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
+from dro_grasp.arm.drivers import Drivers
+from dro_grasp.arm.placing import foot
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
 from dro_grasp.grasps.forces import forces_in_words
+from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldCheck, HoldExpectation, check_hold
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
-FORMAT = 2  # Version of plan files
+PLACING = ("carry", "lower", "release", "retreat")
+"""What follows where the object is put somewhere: the arm carries it there; straight down; the hand opens; straight back."""
+ALL_STAGES = (*STAGES, *PLACING)  # Those that a plan can have, in their order
+FORMAT = 3  # Version of plan files
+READ = (2, FORMAT)  # Versions that are read: plans of the second put nothing anywhere
 CHOSEN = "chosen"  # Fate of the grasp that the motion carries out
 READY = "could be carried out too"  # Fate of grasps that were given to the planner beside it
 WAITING = "not tried"  # Fate of grasps that were not looked at, since better ones sufficed
@@ -46,15 +55,20 @@ class Trajectory:
         """Duration [s]."""
         return float(self.time[-1])
 
+    def driven(self, drivers: Drivers) -> Trajectory:
+        """The same as drivers count it."""
+        return Trajectory(self.time, drivers.positions(self.position), drivers.rates(self.velocity),
+                          drivers.rates(self.acceleration))
+
 
 @dataclass(frozen=True)
 class MotionPoint:
-    """Where arm and hand should be at one time."""
+    """Where arm and hand should be at one time, as the drivers count it."""
 
     time: float  # Since the start [s]
-    stage: str  # One of STAGES
-    arm: Float[np.ndarray, " n_arm"]  # [rad or m]
-    hand: Float[np.ndarray, " n_dof"]  # [rad or m]
+    stage: str  # One of ALL_STAGES
+    arm: Float[np.ndarray, " n_arm"]  # [rad or m, unless the robot file states other units]
+    hand: Float[np.ndarray, " n_dof"]  # Likewise
     hand_effort: Float[np.ndarray, " n_dof"] | None = None  # [Nm or N]; None if the plan knows none
 
 
@@ -80,6 +94,14 @@ class PlanNotes:
     squeeze_force: float | None = None  # Sum of the normal forces at the squeeze [N], likewise
     squeeze_torque: tuple[float, ...] | None = None
     """Efforts of the hand's independent joints at the squeeze [Nm or N], positive toward larger values; None if unknown."""
+    place: list[list[float]] | None = None
+    """Motion of the object, 4x4 in the world [m], from where it stood to where it is put; None if it is only lifted."""
+    zeros: tuple[float, ...] | None = None
+    """See `Drivers`, of arm and hand; None where drivers count as the description does."""
+    scales: tuple[float, ...] | None = None
+    """Likewise."""
+    hold: dict[str, tuple[float, ...]] | None = None
+    """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +118,14 @@ class PlanScene:
 
 @dataclass(frozen=True, eq=False)
 class MotionPlan:
-    """Arm and hand over time, from home to the lifted object."""
+    """Arm and hand over time, from home to the lifted object, or to where the hand has left it."""
 
     notes: PlanNotes
     """What the plan is for, and how it came about."""
     scene: PlanScene
     """Object, obstacles and all grasps, in the world."""
     stage: Int[np.ndarray, " k"]
-    """Index into STAGES of each sample."""
+    """Index into ALL_STAGES of each sample."""
     arm: Trajectory
     """Time, position, velocity and acceleration of the arm's joints."""
     hand: Trajectory
@@ -114,45 +136,86 @@ class MotionPlan:
         """Duration [s]."""
         return self.arm.seconds
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of its stages, in their order."""
+        return ALL_STAGES if self.notes.place is not None else STAGES
+
+    @property
+    def squeeze(self) -> Float[np.ndarray, " n_dof"]:
+        """The hand's joints while it holds the object [rad or m]."""
+        return self.hand.position[self.part("lift")][-1]
+
+    @property
+    def drivers(self) -> tuple[Drivers, Drivers]:
+        """How the drivers of the arm and of the hand count joints."""
+        notes, count = self.notes, len(self.notes.arm_joints)
+        both = Drivers.usual(count + len(notes.hand_joints))
+        if notes.zeros is not None and notes.scales is not None:
+            both = Drivers(notes.zeros, notes.scales)
+        return both.part(slice(None, count)), both.part(slice(count, None))
+
+    @property
+    def hold(self) -> HoldExpectation | None:
+        """Joints and efforts to expect after the lift, with the object in the hand and without; None in plans of before."""
+        known = self.notes.hold
+        return None if known is None else HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS))
+
+    def check_hold(self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None) -> HoldCheck:
+        """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
+
+        Raises:
+            OptionError: Measurements have another shape, or are not finite.
+            PlanError: The plan was made before plans stated what to expect.
+        """
+        if (expected := self.hold) is None:
+            raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
+        return check_hold(expected, measured_joints, measured_efforts)
+
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
-        first, end = (int(np.searchsorted(self.stage, STAGES.index(stage), side)) for side in ("left", "right"))
+        first, end = (int(np.searchsorted(self.stage, ALL_STAGES.index(stage), side)) for side in ("left", "right"))
         return slice(max(0, first - 1), end)
 
     @property
     def hand_effort(self) -> Float[np.ndarray, "k n_dof"] | None:
         """Efforts of the hand's joints at the same times [Nm or N]; None if those of the squeeze are unknown.
 
-        They are zero until the hand is closed to the grasp, grow with its way from there to the squeeze, and then stay.
+        They are zero until the hand is closed to the grasp, grow with its way from there to the squeeze, and then stay; where
+        it releases the object, they shrink likewise.
         """
         if self.notes.squeeze_torque is None:
             return None
         grasp = self.scene.joints[self.notes.chosen].astype(np.float64)
-        way = self.hand.position[-1] - grasp
+        way = self.squeeze - grasp
         share = np.clip((self.hand.position - grasp) @ way / max(float(way @ way), TINY), 0, 1)
-        share[self.stage < STAGES.index("close")] = 0
-        share[self.stage > STAGES.index("close")] = 1
+        closes, lifts, releases = (ALL_STAGES.index(name) for name in ("close", "lift", "release"))
+        share[(self.stage < closes) | (self.stage > releases)] = 0
+        share[(self.stage >= lifts) & (self.stage < releases)] = 1
         return share[:, None] * np.array(self.notes.squeeze_torque)
 
     def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
-        """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""
-        effort = self.hand_effort
-        columns = [self.arm.position, self.hand.position, *([] if effort is None else [effort])]
+        """Targets at a rate [1/s], the last one included, as drivers count joints: for a loop that sends them to a robot."""
+        effort, (of_arm, of_hand) = self.hand_effort, self.drivers
+        columns = [of_arm.positions(self.arm.position), of_hand.positions(self.hand.position)]
+        columns += [] if effort is None else [of_hand.efforts(effort)]
         count = int(np.ceil(self.seconds * rate - 1e-9))
         for time in [*(i / rate for i in range(count)), self.seconds]:
             row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
-            yield MotionPoint(float(time), STAGES[int(self.stage[row])], *(
+            yield MotionPoint(float(time), ALL_STAGES[int(self.stage[row])], *(
                 np.array([np.interp(time, self.arm.time, column) for column in table.T]) for table in columns))
 
     def lines(self) -> list[str]:
         """The plan for people: what was dropped, what is done, how long it takes."""
         n = self.notes
-        spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
+        spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in self.stages)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
         forces = f"; it {told}" if (told := forces_in_words(n.payload, n.squeeze_force)) else ""
+        put = [] if n.place is None else [_place_in_words(np.array(n.place), self.scene.points)]
         return [
             grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
             f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'{forces}",
+            *put,
             f"motion of {self.seconds:.1f} s: {spans}",
             "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
         ]
@@ -163,7 +226,7 @@ class MotionPlan:
         Raises:
             OutputError: The path cannot be written.
         """
-        header = json.dumps({"format_version": FORMAT, "stages": STAGES, "fate": self.scene.fate, **asdict(self.notes)})
+        header = json.dumps({"format_version": FORMAT, "stages": self.stages, "fate": self.scene.fate, **asdict(self.notes)})
         arrays = {"time": self.arm.time, "stage": self.stage}
         arrays |= {f"scene_{name}": getattr(self.scene, name).astype(np.float32) for name in SCENE}
         for name, part in (("arm", self.arm), ("hand", self.hand)):
@@ -182,15 +245,24 @@ class MotionPlan:
         expected = reading(path, PlanError, "a plan file (.npz), as `dro-grasp plan` writes it", *UNTYPED)
         with expected, path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
-            if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
+            stages = tuple(header.pop("stages", ()))
+            if header.pop("format_version", None) not in READ or stages != (ALL_STAGES if header.get("place") else STAGES):
                 raise PlanError(f"{path} is a plan file of another version; plan again")
             time, stage, *rows = (file[name] for name in COLUMNS)
             scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
-            lists = ["arm_joints", "hand_joints", *(["squeeze_torque"] if header.get("squeeze_torque") is not None else [])]
-            for name in lists:
+            lists = [name for name in ("squeeze_torque", "zeros", "scales") if header.get(name) is not None]
+            for name in ("arm_joints", "hand_joints", *lists):
                 header[name] = tuple(header[name])
+            if (hold := header.get("hold")) is not None:
+                header["hold"] = {name: tuple(row) for name, row in hold.items()}
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
+
+
+def _place_in_words(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> str:
+    """Where a motion puts an object, and by how much it turns it about the vertical."""
+    x, y, z = T[:3, :3] @ foot(points) + T[:3, 3]
+    return f"put at ({x:.3f}, {y:.3f}, {z:.3f}) m, turned by {math.degrees(math.atan2(T[1, 0], T[0, 0])):.0f} degrees"
 
 
 def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
@@ -202,39 +274,50 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
 def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
     """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces.
 
-    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints.
+    Where the efforts of the squeeze are known, a sensor_msgs/JointState `squeeze` states them beside its joints. `held` and
+    `empty` state what to expect after the lift, with the object in the hand and without.
 
     Args:
         plan: What is written.
         efforts: Write efforts into the hand's points, too, if they are known: for controllers with an effort interface, which
             add them to what they command. A joint_trajectory_controller without one refuses them.
     """
-    notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in STAGES}
-    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm),
-                "hand": _message(notes.frame, notes.hand_joints, plan.hand, plan.hand_effort if efforts else None)}
+    notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in plan.stages}
+    (of_arm, of_hand), effort = plan.drivers, plan.hand_effort if efforts else None
+    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm.driven(of_arm)),
+                "hand": _message(notes.frame, notes.hand_joints, plan.hand.driven(of_hand),
+                                 None if effort is None else of_hand.efforts(effort))}
     told = forces_in_words(notes.payload, notes.squeeze_force)
     if notes.squeeze_torque is not None:
         messages["squeeze"] = {
-            "header": _header(notes.frame), "name": list(notes.hand_joints), "position": _plain(plan.hand.position[-1]),
-            "velocity": [], "effort": _plain(np.array(notes.squeeze_torque))}
-    return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, efforts in Nm or N, time in s.\n"
+            "header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
+            "position": _plain(of_hand.positions(plan.squeeze)),
+            "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
+    if (hold := plan.hold) is not None:
+        for name, joints, forces in (("held", hold.held_joints, hold.held_efforts),
+                                     ("empty", hold.empty_joints, hold.empty_efforts)):
+            messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
+                              "position": _plain(of_hand.positions(joints)), "effort": _plain(of_hand.efforts(forces))}
+    units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
+    does = "lifts" if notes.place is None else "lifts and places"
+    return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
 
 
 def trajectory_csv(plan: MotionPlan) -> str:
     """One row for each sample: time, stage, and the target of every joint, arm before hand, then known efforts of the hand."""
-    text, effort = io.StringIO(), plan.hand_effort
+    text, effort, (of_arm, of_hand) = io.StringIO(), plan.hand_effort, plan.drivers
     table = csv.writer(text, lineterminator="\n")
     joints = [f"arm/{n}" for n in plan.notes.arm_joints] + [f"hand/{n}" for n in plan.notes.hand_joints]
-    columns = [plan.arm.position, plan.hand.position]
+    columns = [of_arm.positions(plan.arm.position), of_hand.positions(plan.hand.position)]
     if effort is not None:
         joints += [f"effort/{n}" for n in plan.notes.hand_joints]
-        columns.append(effort)
+        columns.append(of_hand.efforts(effort))
     table.writerow(["time", "stage", *joints])
     for i, time in enumerate(plan.arm.time.tolist()):
         values = _plain(np.concatenate([column[i] for column in columns]))
-        table.writerow([round(time, DIGITS), STAGES[int(plan.stage[i])], *values])
+        table.writerow([round(time, DIGITS), ALL_STAGES[int(plan.stage[i])], *values])
     return text.getvalue()
 
 

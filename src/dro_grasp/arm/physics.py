@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 
 from dro_grasp.arm.reachability import Feasible, Postures
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, moved, robot_spec, wxyz
+from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, add_solids, moved, robot_spec, wxyz
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -35,6 +35,7 @@ DAMPING_TIME = 0.03
 """Damping of an arm's servo over its stiffness [s] (ours); the wanted velocity is fed forward, so nothing lags behind."""
 MEMORY = 2**28
 """Memory for contacts [bytes]; what is not needed is never touched. Ours: by itself MuJoCo has room for some 300 contacts."""
+FIXTURES = "fixtures"  # Name of the body of things that do not move
 SHAPE_GROUP = 4  # Group of the geoms that only cameras see: the objects' true meshes
 BALL_BIT = 2  # Bit of contacts of an estimated object's balls with the hand (ours)
 HULL_BIT = 4  # Bit of contacts of its convex hull with the table (ours)
@@ -65,16 +66,21 @@ def object_name(index: int) -> str:
 class LiftScene:
     """Robot, table and objects, and the state that they are in."""
 
-    def __init__(self, cell: Workcell, objects: Sequence[ObjectModel]) -> None:
-        """Build the scene of the cell's robot and table, with the robot at home and the objects far away."""
+    def __init__(self, cell: Workcell, objects: Sequence[ObjectModel], fixtures: Sequence[ObjectModel] = ()) -> None:
+        """Build the scene of the cell's robot and table, with the robot at home and the objects far away.
+
+        Fixtures stand where they are, in the world's frame; they are not among the objects.
+        """
         robot = self.robot = cell.robot
-        self.objects = tuple(objects)
+        self.objects, self.fixtures = tuple(objects), tuple(fixtures)
         scene = robot_spec(robot, LIFT_PROTOCOL, robot.table)
         scene.memory = MEMORY
         for body in list(scene.bodies)[1:]:
             body.gravcomp = 1.0  # a robot's controller holds its own weight
         _add_arm_servos(scene, robot)
         add_servos(scene, robot.hand, LIFT_PROTOCOL)
+        if fixtures:
+            add_solids(scene, scene.worldbody.add_body(name=FIXTURES), fixtures)
         self._centres = [_add_thing(scene, obj, i) for i, obj in enumerate(objects)]
         if robot.table is not None:
             board = scene.geom(TABLE)

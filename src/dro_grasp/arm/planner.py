@@ -19,10 +19,11 @@ from torch import Tensor
 
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
-from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
+from dro_grasp.arm.placing import Place, Places, Placing
+from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, carried, reachable_directions
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.trajectory import find_path, timed_stages
-from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
+from dro_grasp.arm.workcell import CARRIED, OBSTACLE, Workcell, moved, scene_solid, upright
 from dro_grasp.devices import Stopwatch, side_by_side
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
@@ -30,6 +31,7 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
+from dro_grasp.grasps.hold import HOLD_COLUMNS
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
@@ -41,6 +43,7 @@ from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
+from dro_grasp.simulation.holding import expect_hold
 
 Directions = Literal["paper", "all"]  # Palm directions that are asked for
 ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
@@ -115,8 +118,9 @@ def plan(
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
     start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+    place: Sequence[float] | str | Place | None = None,
 ) -> MotionPlan:
-    """A motion that grasps the object and lifts it.
+    """A motion that grasps the object and lifts it, and puts it down where that is asked for.
 
     Args:
         robot: Arm, hand and table. Without a table, the level plane below the object counts as one.
@@ -128,10 +132,13 @@ def plan(
         seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
         grasps: Complete grasps with scores, in the world's frame, instead of predicted ones; or what makes a batch from a seed.
         start: Where the arm's joints are when the motion begins [rad or m]; home by default. The hand is open.
+        place: Where to put it, and let it go: x, y, z of the middle of its foot in the world [m], and a turn about the vertical
+            [rad], any if that is left out; or "table" or the name of an obstacle, where a place is chosen. It stands there as
+            it stands now, or as its mesh stands stably.
 
     Raises:
-        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, or no
-            grasp can be carried out; the message counts what was dropped where.
+        PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, the place is
+            impossible, or no grasp can be carried out; the message counts what was dropped where.
         RobotError: The robot collides with the table, or with itself, at the start.
         OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, the start is out of the joints' range, or
             the constraints leave nothing of the object.
@@ -140,7 +147,8 @@ def plan(
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start)
+    wanted = place if place is None or isinstance(place, Place) else Place.of(place)
+    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted)
     task.check_start()
     tries = Tries()
     for batch, last in candidates(task, tries, grasps, predictor):
@@ -161,7 +169,7 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One object to lift."""
+    """One object to lift, and to put somewhere if a place is asked for."""
 
     cell: Workcell
     obj: ObjectModel  # With a frame whose z axis points up
@@ -170,11 +178,13 @@ class Task:
     constraints: Constraints  # Without obstacles, which the cell has
     seed: int
     start: Float[np.ndarray, " n_arm"]  # Of the arm [rad or m]
+    place: Place | None = None
 
     @staticmethod
     def of(
         robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+        place: Place | None = None,
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
         obj, T = upright(obj, T_world_object)
@@ -185,7 +195,7 @@ class Task:
             obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
         first = robot.home if start is None else robot.require_start(start)
         return Task(
-            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first)
+            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place)
 
     @property
     def robot(self) -> Robot:
@@ -203,10 +213,21 @@ class Task:
         middle = self.T[:2, :3] @ self.obj.cloud.mean(0) + self.T[:2, 3]
         return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
 
+    def at_object(self, grasps: GraspBatch) -> GraspBatch:
+        """Grasps in the world, in the object's frame."""
+        return grasps.replace(T_object_wrist=torch.from_numpy(np.linalg.inv(self.T)).float() @ grasps.T_object_wrist)
+
     @cached_property
     def reach(self) -> Reachability:
         """Inverse kinematics, with its own draws."""
-        return Reachability(self.cell, self.config.reach, self.seed)
+        return Reachability(self.cell, self.config.reach, self.seed, self.places)
+
+    @cached_property
+    def places(self) -> Places | None:
+        """Where the object may be put."""
+        if self.place is None:
+            return None
+        return Placing(self.cell, self.place).places()
 
     @cached_property
     def rehearsal(self) -> Rehearsal | None:
@@ -227,6 +248,7 @@ class Task:
             raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "
                             f"hand are long ({longest:.2f} m); give its place in the robot's world frame [m]")
         self.cell.refuse_contacts(self.start, "at home" if np.array_equal(self.start, self.robot.home) else "at the start")
+        _ = self.places  # refused before the work
 
     def advice(self, dropped: dict[str, int]) -> str:
         """What to change, by the reason for which most grasps were dropped."""
@@ -261,7 +283,7 @@ class Tries:
     lost: list[Feasible] = field(default_factory=list)  # Can be carried out, but lose the object when rehearsed
     dropped: dict[int, str] = field(default_factory=dict)  # Why
     shortage: str = ""  # Why a batch had no grasp at all
-    watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
+    watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing", "hold"))
 
     @property
     def grasps(self) -> GraspBatch:
@@ -312,10 +334,8 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     tries.parts.append(grasps)
     with tries.watch("reach"):
         if task.constraints != Constraints():  # table and obstacles are the arm's affair
-            T = np.linalg.inv(task.T)
-            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
-            there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
-            for reason, wrong in violations(problem, there).items():
+            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(np.linalg.inv(task.T)))
+            for reason, wrong in violations(problem, task.at_object(grasps)).items():
                 for row in wrong.nonzero()[:, 0].tolist():
                     tries.dropped.setdefault(first + row, reason)
         for row, reason in task.reach.hopeless(grasps).items():
@@ -393,10 +413,16 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
             waypoints, reached = path
             goal = left.pop(reached)
             postures = Postures.of(robot, tries.grasps, goal.index)
+            with tries.watch("path"):
+                carry = None if goal.put is None else carry_path(task, goal, postures, seed)
             with tries.watch("timing"):
-                made = timed_stages(task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds)
+                made = timed_stages(
+                    task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds, carry,
+                ) if goal.put is None or carry is not None else None
             if made is not None:
-                notes, scene = _described(task, tries, goal.index, goals, left)
+                with tries.watch("hold"):
+                    expected = expect_hold(robot.hand, task.obj, task.at_object(tries.grasps[[goal.index]]))
+                notes, scene = _described(task, tries, goal, goals, left, expected)
                 return MotionPlan(notes, scene, *made)
             tries.dropped[goal.index] = Fault.NO_PATH
         elif not best:
@@ -405,10 +431,26 @@ def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> Motion
     return None
 
 
+def carry_path(task: Task, goal: Feasible, hand: Postures, seed: int) -> Float[np.ndarray, "k n_arm"] | None:
+    """Waypoints with the object in the hand, from the end of the lift to above its place; None if none is found."""
+    robot, cell = task.robot, task.cell
+    assert goal.put is not None
+    T_grasp = robot.T_world_wrist(goal.approach[-1])
+
+    def free(q: Float[np.ndarray, " n_arm"]) -> bool:
+        return cell.free(q, hand.squeeze, moved=carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=CARRIED)
+
+    if not free(goal.lift[-1]):
+        return None
+    found = find_path(goal.lift[-1], goal.put.lower[:1], free, *robot.working_range, task.config.planner_seconds, seed)
+    return None if found is None else found[0]
+
+
 def _described(
-    task: Task, tries: Tries, chosen: int, goals: list[Feasible], left: list[Feasible]
+    task: Task, tries: Tries, goal: Feasible, goals: list[Feasible], left: list[Feasible], expected: GraspBatch
 ) -> tuple[PlanNotes, PlanScene]:
     """What a motion to the chosen goal was planned for, and how it came about."""
+    chosen = goal.index
     robot, obj, T, grasps, ready = task.robot, task.obj, task.T, tries.grasps, {goal.index for goal in left}
     clouds = [np.zeros((0, 3), np.float32), *(thing.cloud for thing in task.cell.obstacles)]
     wrists = grasps.T_object_wrist.double().numpy()
@@ -418,7 +460,10 @@ def _described(
         robot.name, obj.name, robot.arm_joints, robot.hand_joints, "world", task.height, len(grasps), tries.counts, len(goals),
         chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds,
         known(grasps.payload[chosen]), known(grasps.squeeze_force[chosen]),
-        None if effort is None else tuple(effort.double().tolist()))
+        None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
+        zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
+        scales=None if robot.drivers.are_usual else robot.drivers.scales,
+        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS})
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

@@ -16,8 +16,9 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.arm.placing import Places
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.workcell import VOXEL, Workcell, arm_addresses
+from dro_grasp.arm.workcell import CARRIED, VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
@@ -25,6 +26,10 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 
 TURNED = 0.12  # Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)
+LOWERED = 0.08  # Height from which an object is lowered straight [m] (ours)
+LEAST_OPEN = 0.5  # Least share of the way from grasp to pregrasp that the hand opens, where others stand in its way (ours)
+PLACE_SEEDS = 4  # Starts of inverse kinematics at a place: the end of the lift, the grasp, home, and random ones (ours)
+TILTED = 1e-3  # Deeper than a place allows that an object may be in a surface [m]: what inverse kinematics leaves open (ours)
 STEEPEST = 0.2  # Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below
 
 
@@ -38,6 +43,7 @@ class Fault(StrEnum):
     COLLIDES = "with the robot in collision"
     NO_LINE = "without a straight approach"
     NO_LIFT = "without a straight lift"
+    NO_PLACE = "without a way to put it there"
     LOSES = "losing the object when rehearsed"
     NO_PATH = "without a path"  # to any of the goals, or the timed motion would touch something
 
@@ -71,12 +77,24 @@ class ReachConfig(Checked):
 
 
 @dataclass(frozen=True)
+class Put:
+    """How a lifted object is put down."""
+
+    moved: Float[np.ndarray, "4 4"]  # Motion of the object from where it stood [m]
+    lower: Float[np.ndarray, "k n_arm"]  # From above the place down to it [rad or m]
+    retreat: Float[np.ndarray, "m n_arm"]  # From there back [rad or m]
+    released: Float[np.ndarray, " n_dof"]  # The hand on its way back [rad or m]
+    kept: float  # Distance that the object keeps from its surroundings while it is put down, negative within them [m]
+
+
+@dataclass(frozen=True)
 class Feasible:
     """A grasp with the arm's configurations for it."""
 
     index: int  # Of the grasp in its batch
     approach: Float[np.ndarray, "k n_arm"]  # From the standoff to the grasp [rad or m]
     lift: Float[np.ndarray, "m n_arm"]  # From the grasp upwards [rad or m]
+    put: Put | None = None  # Where a place is asked for
 
 
 @dataclass(frozen=True)
@@ -103,9 +121,9 @@ class Postures:
 class Reachability:
     """Finds out how the arm carries out grasps of a workcell's object, or why it does not."""
 
-    def __init__(self, cell: Workcell, config: ReachConfig, seed: int) -> None:
-        """Prepare the solver, whose random starts follow from the seed."""
-        self.cell, self.config = cell, config.within(cell.robot)
+    def __init__(self, cell: Workcell, config: ReachConfig, seed: int, places: Places | None = None) -> None:
+        """Prepare the solver, whose random starts follow from the seed; with places, a grasp has to reach one of them."""
+        self.cell, self.config, self.places = cell, config.within(cell.robot), places
         self.solver, self.random = WristSolver(cell), np.random.default_rng(seed)
         clouds = [thing.cloud for thing in cell.obstacles if thing.is_cloud]
         self._cloud = KDTree(np.concatenate(clouds)) if clouds else None
@@ -142,7 +160,7 @@ class Reachability:
         return nearest
 
     def ways(self, grasps: GraspBatch, index: int) -> Feasible | str:
-        """One grasp with configurations from standoff to lift, or why there are none."""
+        """One grasp with configurations from standoff to lift, and to a place if there are any; or why there are none."""
         robot = self.cell.robot
         T = grasps.T_object_wrist[index].double().numpy()
         ahead = robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
@@ -155,7 +173,8 @@ class Reachability:
                 continue
             outcome = self._through(q, back, up, postures)
             if not isinstance(outcome, str):
-                return Feasible(index, *outcome)
+                found = Feasible(index, *outcome)
+                return found if self.places is None else self._with_place(found, ahead, postures)
             reasons.append(outcome)
         return max(reasons, key=(Fault.OUT_OF_REACH, Fault.COLLIDES, Fault.NO_LINE, Fault.NO_LIFT).index)
 
@@ -177,6 +196,59 @@ class Reachability:
                 free(x, hand.squeeze, clearance, carried(up[i], up[0]), touch=True) for i, x in enumerate(raised)):
             return Fault.NO_LIFT
         return retreat[::-1].copy(), raised
+
+    def _with_place(self, found: Feasible, ahead: Float[np.ndarray, "3"], hand: Postures) -> Feasible | str:
+        """The same with a way to put the object down at the first place that it leads to; `ahead` is the palm's direction."""
+        assert self.places is not None
+        robot, (lower, upper) = self.cell.robot, self.cell.robot.working_range
+        T_grasp = robot.T_world_wrist(found.approach[-1])
+        draws = self.random.uniform(lower, upper, (PLACE_SEEDS - 3, len(lower)))
+        for moved in self.places.motions:
+            turned = moved[:3, :3] @ ahead
+            for seed in [found.lift[-1], found.approach[-1], robot.home, *draws]:
+                q = self.solver.solve(moved @ T_grasp, [seed])
+                if q is not None and (put := self._put(q, T_grasp, turned, hand)) is not None:
+                    return replace(found, put=put)
+        return Fault.NO_PLACE
+
+    def _put(
+        self, q: Float[np.ndarray, " n_arm"], T_grasp: Float[np.ndarray, "4 4"], ahead: Float[np.ndarray, "3"], hand: Postures
+    ) -> Put | None:
+        """How the object is put down with the arm in a configuration [rad or m], if there is a way."""
+        free, clearance, robot, places = self.cell.free, self.config.clearance, self.cell.robot, self.places
+        assert places is not None
+        T, kept = robot.T_world_wrist(q), -places.allowed - TILTED
+        moved = carried(T, T_grasp)
+        if not free(q, hand.squeeze, clearance, moved, touch=True, kept=kept):
+            return None
+        height = min(LOWERED, self.config.lift)
+        up, back = self._line(T, np.array([0, 0, height])), self._line(T, -self.config.standoff * ahead)
+        raised = self.solver.follow(up, q)
+        if raised is None or not free(raised[-1], hand.squeeze, moved=carried(up[-1], T_grasp), touch=True, kept=CARRIED):
+            return None
+        if not all(free(x, hand.squeeze, clearance, carried(up[i], T_grasp), touch=True, kept=kept)
+                   for i, x in enumerate(raised)):
+            return None
+        released = self._released(q, moved, hand, kept)
+        if released is None or (retreat := self.solver.follow(back, q)) is None:
+            return None
+        opening = np.linspace(0, 1, 5)[:, None] * (hand.opened - released) + released
+        gone = all(free(x, released, clearance, moved, touch=True, kept=kept) for x in retreat) and all(
+            free(retreat[-1], shape, clearance, moved, kept=kept) for shape in opening)
+        return Put(moved, raised[::-1].copy(), retreat, released, kept) if gone else None
+
+    def _released(
+        self, q: Float[np.ndarray, " n_arm"], moved: Float[np.ndarray, "4 4"], hand: Postures, kept: float
+    ) -> Float[np.ndarray, " n_dof"] | None:
+        """The hand opened towards the pregrasp as far as it is free [rad or m]; None if that is less than LEAST_OPEN."""
+        released, shares = None, np.linspace(0, 1, 9)
+        for share in shares:
+            posture = hand.grasp + share * (hand.pregrasp - hand.grasp)
+            if not self.cell.free(q, posture, self.config.clearance, moved, touch=True, kept=kept):
+                break
+            if share >= LEAST_OPEN:
+                released = posture
+        return released
 
     def _line(self, T: Float[np.ndarray, "4 4"], motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 4 4"]:
         count = max(2, round(float(np.linalg.norm(motion)) / self.config.step) + 1)

@@ -17,6 +17,7 @@ import torch
 import yaml
 from jaxtyping import Float
 
+from dro_grasp.arm.drivers import ANGLES, LENGTHS, Drivers
 from dro_grasp.errors import HandError, OptionError, RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
@@ -35,6 +36,7 @@ BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in rob
 HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
 Read = TypeVar("Read")
 POSE_KEYS = {"position", "quaternion_wxyz"}  # What a robot file states of a pose
+DRIVER_KEYS = ("zeros", "signs", "units")  # What a robot file states of drivers, each by joint
 FARTHEST_MOUNT = 2.0  # Largest distance of a hand from the link that carries it [m] (ours)
 TURN = np.pi  # Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)
 
@@ -94,6 +96,8 @@ class Robot:
     """A depth camera that stands still; None without one."""
     table: Table | None
     """The table that objects stand on; None without one."""
+    drivers: Drivers
+    """How the drivers of arm and hand count the joints."""
 
     @property
     def arm_joints(self) -> tuple[str, ...]:
@@ -108,7 +112,8 @@ class Robot:
     @property
     def sha256(self) -> str:
         """Hash of all that motions depend on: robots of one hash are the same, whatever they and their files are called."""
-        own = {name: value for name, value in flat(self).items() if not name.startswith(("name", "arm.", "hand."))}
+        other = ("name", "arm.", "hand.", "drivers")
+        own = {name: value for name, value in flat(self).items() if not name.startswith(other)}
         stated = own | {"arm": self.arm.sha256, "hand": self.hand.sha256}
         return hashlib.sha256(json.dumps(stated, sort_keys=True, default=_rounded).encode()).hexdigest()
 
@@ -246,12 +251,14 @@ def load_robot(name: str | Path) -> Robot:
         none = np.zeros(len(fit.joints))
         lower, upper = faults.of(fit.positions, (none - np.inf, none + np.inf))
         home = faults.of(lambda: fit.home(lower, upper), none)
+        loaded = load_hand(file.hand)
+        drivers = faults.of(lambda: _drivers(file, arm, loaded), Drivers.usual(len(fit.joints)))
         velocity, acceleration, effort = (
             faults.of(lambda kind=kind, usual=usual: fit.limit(kind, usual), none)
             for kind, usual in (("velocity", None), ("acceleration", None), ("effort", 50.0)))
     return Robot(
-        file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base, home, lower, upper, velocity,
-        acceleration, effort, file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+        file.name, arm, loaded, fit.mount, file.T_link_wrist, file.T_world_base, home, lower, upper, velocity, acceleration,
+        effort, file.hand_velocity, file.hand_acceleration, file.camera, file.table, drivers)
 
 
 def _load_arm(file: _RobotFile, within: str | None) -> Description:
@@ -299,7 +306,7 @@ class _RobotFile:
             values = yaml.safe_load(path.read_text())
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
-        known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table"}
+        known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table", *DRIVER_KEYS}
         values = self.mapping(values, "the file", known, {"arm", "hand"})
         self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
         hand = str(values["hand"])
@@ -320,6 +327,7 @@ class _RobotFile:
             for kind, usual in (("velocity", 2.0), ("acceleration", 10.0)))
         self.camera = faults.of(lambda: self._camera(values.get("camera")), None)
         self.table = faults.of(lambda: self._table(values.get("table")), None)
+        self.drivers = {key: faults.of(lambda key=key: self.mapping(values.get(key, {}), key), {}) for key in DRIVER_KEYS}
 
     def _mount(self, values: dict[Any, Any]) -> dict[Any, Any]:
         return self.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"}) if "mount" in values else {}
@@ -422,6 +430,38 @@ def _quoted(names: Sequence[str]) -> str:
 def _is_number(value: Any) -> bool:
     """Whether an entry of a robot file is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _drivers(file: _RobotFile, arm: Description, hand: Hand) -> Drivers:
+    """What the file states of drivers, by the joints of arm and hand; one that both have is told apart as `hand/NAME`."""
+    turns = [unit == 1 for tree in (arm.tree, hand.tree) for unit in tree.joint_unit.tolist()]
+    names = [*arm.tree.joint_names, *hand.tree.joint_names]
+    shared = set(arm.tree.joint_names) & set(hand.tree.joint_names)
+    called = [f"{'arm' if i < arm.tree.n_dof else 'hand'}/{name}" if name in shared else name for i, name in enumerate(names)]
+    for key, stated in file.drivers.items():
+        if unknown := [str(name) for name in stated if name not in called]:
+            raise file.error(f"{key} names joint '{unknown[0]}'; the joints of arm and hand are {', '.join(called)}")
+    zeros = [file.number(file.drivers["zeros"].get(name, 0.0), f"zeros of joint {name}") for name in called]
+    scales = [_sign(file, name) * _unit(file, name, ANGLES if turn else LENGTHS)
+              for name, turn in zip(called, turns, strict=True)]
+    return Drivers(tuple(zeros), tuple(scales))
+
+
+def _sign(file: _RobotFile, name: str) -> float:
+    sign = file.drivers["signs"].get(name, 1)
+    if sign not in (1, -1) or isinstance(sign, bool):
+        raise file.error(f"signs of joint {name} is {sign!r}; expected 1, or -1 where its driver counts the other way")
+    return float(sign)
+
+
+def _unit(file: _RobotFile, name: str, known: dict[str, float]) -> float:
+    unit = file.drivers["units"].get(name, 1.0)
+    if isinstance(unit, str) and unit in known:
+        return known[unit]
+    if isinstance(unit, str):
+        whole = "metre" if known is LENGTHS else "radian"
+        raise file.error(f"units of joint {name} is '{unit}'; expected {', '.join(known)}, or how many of them a {whole} has")
+    return file.positive(unit, f"units of joint {name}")
 
 
 class _Fit:

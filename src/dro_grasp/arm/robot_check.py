@@ -51,13 +51,15 @@ class RobotReport:
     def to_dict(self) -> dict[str, Any]:
         """The report for programs."""
         r = self.robot
+        drivers = {name: {"zero": zero, "scale": scale} for name, zero, scale in zip(
+            (*r.arm_joints, *r.hand_joints), r.drivers.zeros, r.drivers.scales, strict=True)}
         columns = ("home", "lower", "upper", "velocity", "acceleration", "effort")
         joints = {n: {c: float(getattr(r, c)[i]) for c in columns} for i, n in enumerate(r.arm_joints)}
         return {"robot": r.name, "joints": joints, "hand": r.hand.name, "hand_joints": list(r.hand_joints),
                 "mount_link": r.mount_link, "wrist_at_home": r.T_world_wrist(r.home).tolist(), "camera": r.camera is not None,
                 "table": None if r.table is None else r.table.height, "reach": list(self.reach), "free_share": self.free_share,
                 "excluded": [list(p) for p in self.excluded], "home_contacts": list(self.home_contacts),
-                "blocking": self.blocking, "usable": self.usable}
+                "drivers": drivers, "blocking": self.blocking, "usable": self.usable}
 
     def lines(self) -> list[str]:
         """The report for people."""
@@ -74,6 +76,7 @@ class RobotReport:
             f"link {r.mount_link}",
             *(f"  {n}: home {h:.2f}, {lo:.2f} to {up:.2f}, at most {v:g} /s and {a:g} /s^2" for n, h, lo, up, v, a in zip(
                 r.arm_joints, r.home, r.lower, r.upper, r.velocity, r.acceleration, strict=True)),
+            *(f"  {line}" for line in r.drivers.lines((*r.arm_joints, *r.hand_joints))),
             f"wrist at home: ({place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f}) m; {table}; {camera}",
             f"reach: the grasp centre gets close above the table {self.reach[0]:.2f} to {self.reach[1]:.2f} m from the base"
             if np.isfinite(self.reach).all() else "reach: the grasp centre was never found close above the table",

@@ -1,6 +1,6 @@
 """The experiment: attempts to lift objects, each from the depth image to the shaken object; stored as they come, with rates.
 
-In one attempt an object comes to rest on the table, is seen, planned for, grasped, lifted, held and shaken.
+In one attempt an object comes to rest on the table, is seen, planned for, grasped, lifted, then held and shaken, or placed.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from dro_grasp.arm.motion import STAGES, MotionPlan
+from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan
 from dro_grasp.arm.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
+from dro_grasp.arm.placing import AWAY, foot, off_table
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.reachability import ReachConfig
 from dro_grasp.arm.robot import CameraMount, Robot, Table, load_robot
@@ -41,6 +42,7 @@ from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.depth_noise import DepthView, NoiseName, depth_noise, measured_depth
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
@@ -50,6 +52,11 @@ from dro_grasp.simulation.scene import PREFIX
 LABEL = "tabletop/3 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 APART = 0.03  # Distance between the outlines of objects as they are put down [m] (ours)
+PLACED_WITHIN = 0.02  # Largest distance from its place of an object that is placed [m]. Source: the project's aim (ours)
+PLACED_UPRIGHT = 15.0  # Largest tilt of it [degrees], likewise
+FELL = 45.0  # Tilt from which on it is said to have fallen over [degrees] (ours)
+SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
+REFLECTANCES = (0.1, 0.9)  # Shares of the light that things return, the table among them [1] (ours)
 STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
 
 Region = tuple[float, float, float, float]  # Least x and y, greatest x and y, from the arm's base [m]
@@ -61,8 +68,8 @@ class TabletopConfig(Checked):
 
     see: Literal["cloud", "mesh"] = "cloud"
     """What the planner is given: the cloud of the robot's camera, or, as a control, the true mesh at its true place."""
-    noise: float = 0.0015
-    """Standard deviation of depth [m]."""
+    noise: float | NoiseName = "stereo"
+    """Noise of the camera's depth: that of a kind of camera, or a standard deviation alike for all pixels [m]."""
     region: Region = (0.38, -0.18, 0.58, 0.18)
     """Area where objects are put: least x and y, greatest x and y, from the arm's base [m]."""
     clutter: int = 0
@@ -77,6 +84,8 @@ class TabletopConfig(Checked):
     """How motions are planned."""
     mass: float | None = None
     """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
+    place: bool = False
+    """Whether the object is put down at a random free place of the region, instead of held and shaken."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be set up.
@@ -91,8 +100,7 @@ class TabletopConfig(Checked):
         if wanted.obstacles is not None or wanted.contact_region or wanted.keep_out:
             raise OptionError("objects of attempts come to rest anywhere, so that obstacles, contact_region and keep_out say "
                               "nothing there; leave them out, or use dro_grasp.plan for one object in its place")
-        if not 0 <= self.noise < math.inf:
-            raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
+        depth_noise(self.noise)
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
@@ -103,8 +111,8 @@ class TabletopConfig(Checked):
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
-        # A mass that is not stated is left out: attempts of before it could be are not repeated.
-        given = {name: value for name, value in asdict(self).items() if (name, value) != ("mass", None)}
+        # What is not asked for is left out: attempts of before it could be are not repeated.
+        given = {name: value for name, value in asdict(self).items() if (name, value) not in (("mass", None), ("place", False))}
         return LABEL + json.dumps(given, sort_keys=True)
 
     @staticmethod
@@ -141,9 +149,9 @@ class Attempt:
     settings: str
     """Version and every setting, as `TabletopConfig.label`."""
     success: bool = False
-    """Whether the object was held to the end."""
+    """Whether the object was held to the end, or stands at its place."""
     stage: str = "see"
-    """Where it ended: see, plan, one of the motion's stages, hold, shake, or done."""
+    """Where it ended: see, plan, one of the motion's stages, hold, shake, place, or done."""
     reason: str = ""
     """Why it failed."""
     place: str = "[]"
@@ -166,6 +174,12 @@ class Attempt:
     """Time of one core from the depth image to the timed plan [s]; the other times are by the clock."""
     motion_seconds: float = 0.0
     """Duration of the planned motion [s]."""
+    place_error: float | None = None
+    """Distance of the placed object's centre of mass from where it should be [m]; None if it was not placed."""
+    place_tilt: float | None = None
+    """Angle between the placed object's upright and the one it had [degrees], likewise."""
+    place_turn: float | None = None
+    """How far it is turned about the vertical from what was planned [degrees], likewise."""
     pushed: float = 0.0
     """Largest displacement of another object [m]."""
     robot_file: str = ""
@@ -224,7 +238,8 @@ def attempt(
         see_seconds = time.perf_counter() - begin
         result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
         grasps = None if proposer is None else proposer(seen, T, seed + number)
-        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps)
+        place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
+        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -235,25 +250,27 @@ def attempt(
     if watch is not None:
         watch.planned(seen, made)
     stage, reason = carry_out(scene, made, config, watch)
+    if config.place and not reason:
+        result = measured(result, scene, start, made)
+        stage, reason = place_fault(result.place_error or 0.0, result.place_tilt or 0.0)
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
     pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
 def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:
-    """Let the servos follow a plan, then hold and shake; where it ended, and why if it failed."""
+    """Let the servos follow a plan, then hold and shake, or put down; where it ended, and why if it failed."""
     start = scene.pose(0)
     call = None if watch is None else lambda: watch.moved(scene)
     for stage in STAGES:
-        rows = made.part(stage)
-        for i in range(rows.start + 1, rows.stop):
-            scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
-            scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
+        _follow(scene, made, stage, call)
         if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
     if lifted < config.plan.reach.within(scene.robot).lift / 2:
         return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
+    if made.notes.place is not None:
+        return _put_down(scene, made, call)
     grip = scene.in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]
     for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
@@ -265,10 +282,75 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
                 velocity[0] = angle * phase * np.cos(phase * TICK * k)
             scene.command(target, velocity, hand)
             scene.advance(TICK, call)
-        slip = _apart(scene.in_hand(0), grip)
-        if slip > 0.05 or not scene.touched(0):  # [m] (ours)
-            return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
+        if (slipped := _slipped(scene, grip)):
+            return stage, slipped
     return "done", ""
+
+
+def _follow(scene: LiftScene, made: MotionPlan, stage: str, call: Callable[[], None] | None) -> None:
+    """Let the servos follow one stage of a plan."""
+    rows = made.part(stage)
+    for i in range(rows.start + 1, rows.stop):
+        scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
+        scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
+
+
+def _slipped(scene: LiftScene, grip: Float[np.ndarray, "4 4"]) -> str:
+    """How far the object has moved in the hand since it was held there, if that is too far."""
+    slip = _apart(scene.in_hand(0), grip)
+    lost = slip > 0.05 or not scene.touched(0)  # [m] (ours)
+    return f"the object slipped by {100 * slip:.0f} cm out of the hand" if lost else ""
+
+
+def _put_down(scene: LiftScene, made: MotionPlan, call: Callable[[], None] | None) -> tuple[str, str]:
+    """Let the servos follow the stages after the lift, and wait; where it ended, and why if it failed."""
+    grip = scene.in_hand(0)
+    for stage in PLACING:
+        _follow(scene, made, stage, call)
+        if stage == "carry" and (slipped := _slipped(scene, grip)):
+            return stage, slipped
+    scene.advance(SETTLE_SECONDS, call)
+    return ("retreat", "the hand still touches the object after it has left") if scene.touched(0) else ("done", "")
+
+
+def measured(result: Attempt, scene: LiftScene, start: Float[np.ndarray, "4 4"], made: MotionPlan) -> Attempt:
+    """An attempt with the errors of the placed object, which stood somewhere at the start [m]."""
+    wanted, found, centre = np.array(made.notes.place) @ start, scene.pose(0), scene.objects[0].centre_of_mass
+    off = (found - wanted)[:3, :3] @ centre + (found - wanted)[:3, 3]
+    turn = found[:3, :3] @ wanted[:3, :3].T
+    tilt = math.degrees(math.acos(min(1.0, max(-1.0, turn[2, 2]))))
+    return replace(
+        result, place_error=float(np.linalg.norm(off)), place_tilt=tilt,
+        place_turn=math.degrees(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
+
+
+def place_fault(error: float, tilt: float) -> tuple[str, str]:
+    """Where an attempt with a place ended, and why if the object does not stand there, so far off [m] and tilted [degrees]."""
+    if tilt > FELL:
+        return "place", f"the object fell over: it is tilted by {tilt:.0f} degrees"
+    if tilt > PLACED_UPRIGHT:
+        return "place", f"the object stands tilted by {tilt:.0f} degrees"
+    return ("place", f"placed {100 * error:.1f} cm off") if error > PLACED_WITHIN else ("done", "")
+
+
+def draw_place(
+    scene: LiftScene, seen: PickedObject, region: Region, draw: np.random.Generator
+) -> tuple[float, float, float]:
+    """A random free place in the region, on the table, AWAY from where the object stands; the last one tried if none is."""
+    table, obj, base = seen.robot.table, scene.objects[0], scene.robot.T_world_base[:2, 3]
+    assert table is not None
+    now = scene.pose(0)
+    points = obj.cloud @ now[:3, :3].T + now[:3, 3]
+    middle = foot(points)
+    half = float(np.linalg.norm(points[:, :2] - middle[:2], axis=1).max())
+    others = [o.cloud @ T[:3, :3].T + T[:3, 3] for i, o in enumerate(scene.objects[1:], 1) for T in [scene.pose(i)]]
+    tree, spot = KDTree(np.concatenate(others)[:, :2]) if others else None, middle[:2]
+    for _ in range(1000):
+        spot = base + draw.uniform(region[:2], region[2:])
+        clear = tree is None or tree.query(spot)[0] > half + APART
+        if np.linalg.norm(spot - middle[:2]) > AWAY and clear and off_table(table, np.array([*spot, 0.0])) < -half:
+            break
+    return float(spot[0]), float(spot[1]), table.height
 
 
 def other_objects(name: str, count: int, draw: np.random.Generator) -> list[ObjectModel]:
@@ -326,12 +408,12 @@ def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:
 
 
 def depth_image(
-    scene: LiftScene, camera: CameraMount, noise: float, seed: int
+    scene: LiftScene, camera: CameraMount, noise: float | str, seed: int
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Depth along the camera's z axis [m], and which pixels show the scene's first object.
 
     Depth is zero where nothing is near, and where the robot's model covers the view. Objects are seen as their true meshes.
-    `noise` is the standard deviation of depth [m].
+    `noise` is a preset of `depth_noise`, or the standard deviation of depth [m]. Things are dark or bright by chance.
     """
     row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
@@ -340,16 +422,20 @@ def depth_image(
     world = (rays / length[:, None]) @ camera.T_world_camera[:3, :3].T
     groups = np.array([1, 1, 1, 0, 1, 0], np.uint8)  # true shapes in, convex parts out
     assert groups[SHAPE_GROUP]
-    geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    geom, distance, normal = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0), np.zeros(rays.size)
     eye = camera.T_world_camera[:3, 3].copy()
     mujoco.mj_multiRay(
-        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), 3.0)
+        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, normal, len(rays), 3.0)
     owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
     robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
     seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]
     first = np.array([name == object_name(0) for name in owner])[np.maximum(geom, 0)] & seen
-    drawn = np.random.default_rng(seed).normal(0.0, noise, len(rays))
-    return np.where(seen, distance / length + drawn, 0.0).reshape(row.shape), first.reshape(row.shape)
+    light = np.random.default_rng([seed, 1]).uniform(*REFLECTANCES, scene.model.ngeom)[geom]
+    view = DepthView(
+        np.where(seen, distance / length, 0.0).reshape(row.shape),
+        (normal.reshape(-1, 3) @ camera.T_world_camera[:3, :3]).reshape(*row.shape, 3), thinned_intrinsics(camera),
+        light.reshape(row.shape))
+    return measured_depth(view, depth_noise(noise), seed), first.reshape(row.shape)
 
 
 def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
@@ -532,6 +618,20 @@ def read_attempts(path: Path) -> list[Attempt]:
     expected = "a file of attempts; name another one, or move this one away"
     with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing
         return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in pq.read_table(path).to_pylist()]
+
+
+def lifted(attempts: Sequence[Attempt]) -> list[Attempt]:
+    """Those whose object was in the air, of attempts that put it down."""
+    return [a for a in attempts if a.stage in {*PLACING, "place", "done"}]
+
+
+def placing_errors(attempts: Sequence[Attempt]) -> dict[str, float] | None:
+    """Median errors of the placed objects [m and degrees], and the number placed; None if none was."""
+    rows = [(a.place_error, a.place_tilt) for a in attempts if a.place_error is not None]
+    if not rows:
+        return None
+    error, tilt = np.median(rows, axis=0).tolist()
+    return {"error": error, "tilt": tilt, "n": len(rows)}
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:

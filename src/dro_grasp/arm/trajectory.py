@@ -14,15 +14,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from dro_grasp.arm.motion import STAGES, Trajectory
-from dro_grasp.arm.reachability import Feasible, Postures, carried
-from dro_grasp.arm.workcell import Workcell
+from dro_grasp.arm.motion import Trajectory
+from dro_grasp.arm.reachability import Feasible, Postures, Put, carried
+from dro_grasp.arm.workcell import CARRIED, Workcell
 
 SPACING = 0.08  # Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)
 STEP = 0.01  # Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
 
+CARRY_SPEED = 0.5  # Share of the arm's velocities with which it carries an object [1] (ours): it is held by friction alone
+CARRY_ACCELERATION = 0.25  # The same of its accelerations [1] (ours)
+LOWER_SECONDS = 1.5  # Least time in which an object is lowered [s] (ours)
+RELEASE_SECONDS = 1.5  # Least time in which the hand lets go [s] (ours)
+RETREAT_SECONDS = 1.0  # Least time in which it leaves the object [s] (ours)
+Pair = tuple[Trajectory, Trajectory]  # Of arm and hand, at the same times
 Check = Callable[[Float[np.ndarray, " n"]], bool]  # Whether a configuration is free
 
 
@@ -87,15 +93,34 @@ def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.nda
 
 def timed_stages(
     cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures, closing_seconds: float,
-    grip_seconds: float,
+    grip_seconds: float, carry: Float[np.ndarray, "j n_arm"] | None = None,
 ) -> tuple[Int[np.ndarray, " m"], Trajectory, Trajectory] | None:
     """From home along the waypoints to the standoff, to the grasp, and up; None if the timed motion touches something.
 
-    The hand closes in `closing_seconds` at least, and then presses for `grip_seconds`.
+    The hand closes in `closing_seconds` at least, and then presses for `grip_seconds`. With waypoints `carry` from the end of
+    the lift to above the goal's place, the object is put down there.
 
     Returns:
-        Index into STAGES of each sample, the arm's motion and the hand's.
+        Index into ALL_STAGES of each sample, the arm's motion and the hand's.
     """
+    lifting = _lifting(cell, waypoints, goal, hand, closing_seconds, grip_seconds)
+    if lifting is None:
+        return None
+    placing: list[Pair] | None = []
+    if carry is not None and goal.put is not None:
+        placing = _placing(cell, carry, cell.robot.T_world_wrist(goal.approach[-1]), goal.put, hand)
+        if placing is None:
+            return None
+    arms, hands = zip(*lifting, *placing, strict=True)
+    lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
+    return np.repeat(np.arange(len(arms)), lengths), joined(list(arms)), joined(list(hands))
+
+
+def _lifting(
+    cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures, closing_seconds: float,
+    grip_seconds: float,
+) -> list[Pair] | None:
+    """The STAGES; arguments as for `timed_stages`."""
     robot, n = cell.robot, len(hand.grasp)
     limits = robot.velocity, robot.acceleration
     fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
@@ -120,16 +145,49 @@ def timed_stages(
         cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
     if not free:
         return None
-    arms = [reach, _still(standoff, shape), approach, _still(grasp, close), lift]
-    hands = [_still(hand.opened, reach), shape, _still(hand.pregrasp, approach), close, _still(hand.squeeze, lift)]
-    lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
-    return np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands)
+    return [(reach, still(hand.opened, reach)), (still(standoff, shape), shape), (approach, still(hand.pregrasp, approach)),
+            (still(grasp, close), close), (lift, still(hand.squeeze, lift))]
 
 
-def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
+def _placing(
+    cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], T_grasp: Float[np.ndarray, "4 4"], put: Put, hand: Postures
+) -> list[Pair] | None:
+    """The stages PLACING, with the object that the hand took hold of with its wrist at a pose [m]; None if it hits something.
+
+    The object is set down slowly, and the hand opens slowly: what is let go in a jerk tips over.
+    """
+    robot, n = cell.robot, len(hand.grasp)
+    limits = robot.velocity, robot.acceleration
+    gentle = CARRY_SPEED * robot.velocity, CARRY_ACCELERATION * robot.acceleration
+    fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+
+    def clear(way: Trajectory, kept: float) -> bool:
+        return all(cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=kept)
+                   for q in way.position)
+
+    carry = smooth(waypoints, *gentle, STEP)
+    if not clear(carry, CARRIED / 2):  # it leaves the straight edges that were planned
+        carry = cornered(waypoints, *gentle, STEP)
+    lower = smooth(put.lower, *gentle, LOWER_SECONDS)
+    release = cornered(np.stack([hand.squeeze, hand.grasp, put.released]), *fingers, RELEASE_SECONDS)
+    back = smooth(put.retreat, *limits, RETREAT_SECONDS)
+    opening = smooth(np.stack([put.released, hand.opened]), *fingers, STEP)
+    place, end = put.lower[-1], put.retreat[-1]
+    free = clear(carry, CARRIED / 2) and clear(lower, put.kept) and all(
+        cell.free(place, posture, 0.0, put.moved, touch=True, kept=put.kept) for posture in release.position) and all(
+        cell.free(q, put.released, 0.0, put.moved, touch=True, kept=put.kept) for q in back.position) and all(
+        cell.free(end, posture, 0.0, put.moved, kept=put.kept) for posture in opening.position)
+    if not free:
+        return None
+    retreat = joined([back, still(end, opening)]), joined([still(put.released, back), opening])
+    return [(carry, still(hand.squeeze, carry)), (lower, still(hand.squeeze, lower)), (still(place, release), release),
+            retreat]
+
+
+def still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
     """No motion at the times of another trajectory."""
-    still = np.zeros((len(other.time), len(q)))
-    return Trajectory(other.time, np.tile(q, (len(still), 1)), still, still)
+    rest = np.zeros((len(other.time), len(q)))
+    return Trajectory(other.time, np.tile(q, (len(rest), 1)), rest, rest)
 
 
 def smooth(

@@ -34,6 +34,8 @@ VOXEL = 0.01  # Edge of the cells that a cloud of obstacles fills [m] (ours)
 CLEARANCE = 0.005  # Distance that the robot keeps from everything else while it travels [m] (ours)
 SINK = 0.002
 """How much deeper than at the start a carried object may be in what it stood on or against [m]; clouds are not exact (ours)."""
+CARRIED = 0.01
+"""Distance that a carried object keeps from all but the hand [m] (ours): it shifts in the hand, and clouds are not exact."""
 SAMPLES = 100  # Random configurations in which links that always collide are looked for (ours)
 ALWAYS = 0.95  # Share of these in which they collide (ours)
 
@@ -137,8 +139,7 @@ class Workcell:
             if other == OBSTACLE:
                 pairs, distance = self._detect(start, self.robot.open_hand, None)
                 bad = pairs[self._bad(pairs, distance, CLEARANCE, False, False)].ravel().tolist()
-                geoms = [self.model.geom(geom).name for geom in bad if self._name(geom) == OBSTACLE]
-                numbers = sorted({int(name.split("solid")[1].split(".")[0]) for name in geoms})
+                numbers = sorted({_number(self.model.geom(geom).name) for geom in bad if self._name(geom) == OBSTACLE})
                 names = ", ".join(f"'{self.obstacles[number].name}'" for number in numbers)
                 raise PlanError(f"obstacle {names} collides with {link} while the robot is {where}, "
                                 f"{contact.depth}; cut the robot out of that cloud or mesh, correct its place in the robot's "
@@ -149,26 +150,40 @@ class Workcell:
 
     def contacts(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = 0.0,
-        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None,
     ) -> list[Contact]:
         """What collides.
 
         Args:
             clearance: Distance below which robot and surroundings count as colliding [m], at most CLEARANCE.
-            moved: Motion of the object from where it stands, in the world, if the hand carries it.
+            moved: Motion of the object from where it stands, in the world, if the hand carries it or has put it down.
             touch: The hand may touch the object.
+            kept: Distance that the moved object keeps from table and obstacles [m], at most CARRIED and negative where it may
+                stand in them; by default as where it stood, and SINK less.
         """
         pairs, distance = self._detect(arm, hand, moved)
-        bad = self._bad(pairs, distance, clearance, moved is not None, touch)
+        bad = self._bad(pairs, distance, clearance, moved is not None, touch, kept)
         return [Contact(self._name(a), self._name(b), d)
                 for (a, b), d in zip(pairs[bad].tolist(), distance[bad].tolist(), strict=True)]
 
     def free(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = CLEARANCE,
-        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None,
     ) -> bool:
         """Whether nothing collides; arguments as for `contacts`."""
-        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch).any()
+        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept).any()
+
+    def beside(self, moved: Float[np.ndarray, "4 4"] | None = None) -> list[tuple[float, str]]:
+        """Signed distances of the object, here or moved, to table and obstacles near it, with their names [m]."""
+        pairs, distance = self._detect(self.robot.home, self.robot.open_hand, moved)
+        rows = (np.sort(self._part[pairs], axis=1).reshape(-1, 2) == (Part.SURROUNDINGS, Part.OBJECT)).all(1)
+        met = [next(geom for geom in pair if self._part[geom] == Part.SURROUNDINGS) for pair in pairs[rows].tolist()]
+        return list(zip(distance[rows].tolist(), map(self._thing, met), strict=True))
+
+    def _thing(self, geom: int) -> str:
+        """What a geom of the surroundings is called in errors."""
+        name = self.model.geom(geom).name
+        return f"'{self.obstacles[_number(name)].name}'" if self._name(geom) == OBSTACLE else "the table"
 
     def _name(self, geom: int) -> str:
         body = int(self.model.geom_bodyid[geom])
@@ -186,14 +201,15 @@ class Workcell:
         return data.contact.geom.copy(), data.contact.dist.copy()
 
     def _bad(
-        self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, moved: bool, touch: bool
+        self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, moved: bool, touch: bool,
+        kept: float | None = None,
     ) -> Bool[np.ndarray, " k"]:
         low, high = np.sort(self._part[pairs], axis=1).reshape(-1, 2).T
         bad = distance < np.where(high <= Part.HAND, 0.0, clearance)
         if touch:
             bad &= (high != Part.OBJECT) | (low != Part.HAND)
         beside = (high == Part.OBJECT) & (low == Part.SURROUNDINGS)
-        return np.where(beside, moved & (distance < self._resting - SINK), bad)
+        return np.where(beside, moved & (distance < (self.resting - SINK if kept is None else kept)), bad)
 
     @cached_property
     def _joints(self) -> RobotJoints:
@@ -205,11 +221,9 @@ class Workcell:
         return np.array([_part(self.model.body(int(body)).name) for body in self.model.geom_bodyid])
 
     @cached_property
-    def _resting(self) -> float:
+    def resting(self) -> float:
         """Signed distance of the object, where it stands, to the nearest of table and obstacles, at most zero [m]."""
-        pairs, distance = self._detect(self.robot.home, self.robot.open_hand, None)
-        beside = (np.sort(self._part[pairs], axis=1).reshape(-1, 2) == (Part.SURROUNDINGS, Part.OBJECT)).all(1)
-        return min(0.0, float(distance[beside].min(initial=0.0)))
+        return min([0.0, *(distance for distance, _ in self.beside())])
 
 
 class RobotJoints:
@@ -297,6 +311,11 @@ def _fixed_to_table(robot: Robot) -> list[str]:
     return sorted(found)
 
 
+def _number(geom: str) -> int:
+    """The number of the obstacle that a geom is of, by its name."""
+    return int(geom.split("solid")[1].split(".")[0])
+
+
 def _part(body: str) -> Part:
     if body.startswith(ARM):
         return Part.ARM
@@ -312,7 +331,7 @@ def _set_bits(scene: mujoco.MjSpec, fingers: bool = False) -> None:
         geom.contype, geom.conaffinity = BITS[part]
         if fingers:
             geom.conaffinity |= geom.contype
-        geom.margin = CLEARANCE if part <= Part.HAND else 0.0
+        geom.margin = {Part.SURROUNDINGS: 0.0, Part.OBJECT: CARRIED}.get(part, CLEARANCE)
 
 
 def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.MjSpec:

@@ -34,7 +34,8 @@ class Export:
     only_successful: Flag = False  # Export only grasps that passed their trial.
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object to use instead of the one named in the file, for a file with one object. Needed only to make pregrasps."""
+    """Object to use instead of the one named in the file, for a file with one object. Needed for pregrasps, usd and --hold."""
+    hold: Flag = False  # State what joints and efforts to expect with the object in the hand and without, as simulated.
     json: Flag = False  # Print one JSON object.
 
     def run(self) -> int:
@@ -86,14 +87,18 @@ class Export:
 
         stated = bool(grasps.states_closing.all())
         forces = bool(grasps.squeeze_torque.isfinite().any())  # which are clipped to what the hand exerts
-        needed = FORMATS[self.format].needs_hand or not stated or forces
+        needed = FORMATS[self.format].needs_hand or not stated or forces or self.hold
         hand = hand_of(grasps, self.hand) if needed or self.hand is not None else None
         if hand is not None:
             grasps.require_hand(hand)
-        if hand is not None and not stated:
-            centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
-            grasps = complete(hand, grasps, centre)
-        return ExportJob(grasps, frame, hand, *object_source(grasps))
+        obj = object_of(grasps, self.object, 1.0) if FORMATS[self.format].needs_object or self.hold or not stated else None
+        if hand is not None and obj is not None and not stated:
+            grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=grasps.joints.dtype))
+        if hand is not None and obj is not None and self.hold:
+            from dro_grasp.simulation.holding import expect_hold
+
+            grasps = expect_hold(hand, obj, grasps)
+        return ExportJob(grasps, frame, hand, *object_source(grasps), obj)
 
 
 def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:

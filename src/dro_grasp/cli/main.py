@@ -13,6 +13,7 @@ import tyro
 
 from dro_grasp._version import __version__
 from dro_grasp.cli.benchmark import Benchmark
+from dro_grasp.cli.clear import Clear
 from dro_grasp.cli.dataset import Dataset, Synthesize
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
@@ -55,6 +56,7 @@ Command = (
     | Annotated[Objects, named("objects")]
     | Annotated[Plan, named("plan")]
     | Annotated[Tabletop, named("tabletop")]
+    | Annotated[Clear, named("clear")]
     | Annotated[RobotCommand, named("robot")]
     | Annotated[Weights, named("weights")]
 )

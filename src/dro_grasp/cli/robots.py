@@ -30,7 +30,7 @@ FLOATS = 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan the motion with which a robot grasps an object and lifts it. Needs the extra `[arm]`.
+    """Plan the motion with which a robot grasps an object, lifts it, and may put it down. Needs the extra `[arm]`.
 
     Example: dro-grasp plan --robot xarm7_leaphand --object mug --at 0.5 0.1 --output plan.npz --trajectory plan.yaml
     """
@@ -55,6 +55,11 @@ class Plan:
     of it."""
     start: Annotated[tuple[float, ...] | None, optional("Q ...", "the robot's home")] = None
     """Where the arm's joints are when the motion begins [rad or m], from the base on."""
+    place: Annotated[tuple[float, ...] | None, optional("X Y Z [YAW]", "the object stays in the hand")] = None
+    """Where to put it, and let it go: the middle of its foot [m], upright as it stands, and its turn about the vertical [rad];
+    any without YAW."""
+    place_on: Annotated[str | None, optional("SURFACE", "--place says where")] = None
+    """Put it on a free place that is chosen: `table`, or the name of one of --obstacles."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
@@ -76,10 +81,13 @@ class Plan:
     efforts: Flag = False
     """Write efforts into the hand's points of --trajectory, for controllers with an effort interface; others refuse them."""
     csv: Annotated[Path | None, optional("CSV", "not written")] = None  # The motion as a table.
+    stages: Annotated[Path | None, optional("YAML", "not written")] = None
+    """The task as stages of MoveIt Task Constructor, which plans the motions between them anew."""
     json: Flag = False  # Print one JSON object instead of text.
 
     def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
         """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
+        from dro_grasp.arm.placing import Place
         from dro_grasp.arm.planner import PlanConfig, plan
         from dro_grasp.arm.robot import load_robot
         from dro_grasp.errors import OptionError
@@ -101,9 +109,13 @@ class Plan:
         for option, place in (("--at", self.at), ("--near", self.near)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
-        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
+        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv"), (self.stages, ".yaml")):
             if path is not None:
                 check_output(path, ending)
+        if self.place is not None and self.place_on is not None:
+            raise OptionError("--place and --place-on both say where to put the object; give one of them")
+        if self.place is not None:
+            Place.of(self.place)  # refused before the work
         if self.efforts and self.trajectory is None:
             raise OptionError("--efforts are written into the trajectory file; name one with --trajectory YAML")
         robot = load_robot(self.robot)
@@ -122,8 +134,9 @@ class Plan:
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = (make or plan)(
-            robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start)
-        written = self._write(made)
+            robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start,
+            place=self.place or self.place_on)
+        written = self._write(made, robot)
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
             return 0
@@ -131,21 +144,24 @@ class Plan:
             say(line)
         return 0
 
-    def _write(self, made: MotionPlan) -> dict[str, str]:
+    def _write(self, made: MotionPlan, robot: Robot) -> dict[str, str]:
         """Write the files that were asked for; returns their paths."""
         from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.arm.task_stages import task_yaml
         from dro_grasp.files import replacing
 
         if self.efforts and made.notes.squeeze_torque is None:
             say_aside("warning: the efforts of the grasp are unknown, so the hand's points have none; close with a low limit")
         if self.output is not None:
             made.save(self.output)
-        texts = (self.trajectory, lambda: trajectory_yaml(made, self.efforts)), (self.csv, lambda: trajectory_csv(made))
-        for path, text in texts:
+        texts: tuple[tuple[str, Path | None, Callable[[], str]], ...] = (
+            ("trajectory", self.trajectory, lambda: trajectory_yaml(made, self.efforts)),
+            ("csv", self.csv, lambda: trajectory_csv(made)), ("stages", self.stages, lambda: task_yaml(made, robot)))
+        for what, path, text in texts:
             if path is not None:
-                with replacing(path, "trajectory") as temporary:
+                with replacing(path, what) as temporary:
                     temporary.write_text(text(), encoding="utf-8")
-        return {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
+        return {what: str(path) for what, path, *_ in (("plan", self.output), *texts) if path}
 
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
         """The object with what stands around it, and where its frame is in the world."""
@@ -207,7 +223,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Tabletop:
-    """Let a robot see, plan, grasp, lift, hold and shake objects on its table, in MuJoCo. Needs the extra `[arm]`.
+    """Let a robot see, plan, grasp, lift, hold and shake objects on its table, or place them, in MuJoCo. Needs `[arm]`.
 
     Example: dro-grasp tabletop --robot xarm7_leaphand --objects mug can --attempts 2 --output results.parquet
     """
@@ -220,6 +236,9 @@ class Tabletop:
     order: Literal["score", "random"] = "score"  # Reachable grasps to take: the best by score, or, as a control, any.
     directions: Literal["paper", "all"] = "all"  # Palm directions: paper, from above to the right side, or all.
     constraints: PalmOptions = field(default_factory=PalmOptions)  # In the world frame.
+    place: Flag = False
+    """Put each object down at a random free place, 15 cm away at least, instead of holding and shaking it. It succeeds within
+    2 cm and 15 degrees, upright."""
     mass: Mass = None  # Mass of each object to lift [kg], which its grasps shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
@@ -230,7 +249,8 @@ class Tabletop:
     """Number of other built-in objects that stand around the one to grasp: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
     """How the object's points are separated from others: by distance (cluster), or by the true mask."""
-    noise: float = 0.0015  # Standard deviation of the camera's depth [m].
+    noise: float | Literal["none", "structured_light", "time_of_flight", "stereo"] = "stereo"
+    """Noise of the camera's depth: that of a kind of camera, or a standard deviation alike for all pixels [m]."""
     seed: int = 0  # Seed of all draws.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
@@ -259,7 +279,7 @@ class Tabletop:
             check_output(self.video, *FORMATS)
         config = TabletopConfig(
             self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
-            mass=self.mass, plan=PlanConfig(
+            mass=self.mass, place=self.place, plan=PlanConfig(
                 self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
@@ -272,24 +292,32 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.arm.tabletop import endings, failures, processor_seconds
+        from dro_grasp.arm.tabletop import endings, failures, lifted, placing_errors, processor_seconds
         from dro_grasp.compare.metrics import wilson_interval
 
         held = sum(a.success for a in done)
         low, high = wilson_interval(held, len(done))
         seconds = processor_seconds(done)
+        raised, errors = len(lifted(done)), placing_errors(done)
         if self.json:
+            placing = {"lifted": raised, "placing_errors": errors} if self.place else {}
             print_json({
                 "robot": done[0].robot, "attempts": len(done), "success": held, "success_rate": held / len(done),
-                "interval": [low, high], "ended": endings(done), "processor_seconds": seconds, "failures": failures(done)})
+                "interval": [low, high], **placing, "ended": endings(done), "processor_seconds": seconds,
+                "failures": failures(done)})
             return
         rows = []
         for name in dict.fromkeys(a.object for a in done):
             own = [a for a in done if a.object == name]
             ended = ", ".join(f"{stage} {count}" for stage, count in endings(own).items())
             rows.append([name, f"{sum(a.success for a in own)} of {len(own)}", ended])
-        print_table(f"{done[0].robot}: lifts", ["object", "held", "ended in"], rows)
+        print_table(f"{done[0].robot}: lifts", ["object", "placed" if self.place else "held", "ended in"], rows)
         say(f"{held} of {len(done)} attempts succeeded ({held / len(done):.0%}, 95 % interval {low:.0%} to {high:.0%})")
+        if self.place and raised:
+            low, high = wilson_interval(held, raised)
+            told = f"; median {1e3 * errors['error']:.0f} mm and {errors['tilt']:.0f} degrees off" if errors else ""
+            say(f"{held} of {raised} that were lifted are placed ({held / raised:.0%}, 95 % interval {low:.0%} to {high:.0%})"
+                + told)
         if seconds:
             say(f"depth image to timed plan, time of one core: median {seconds['median']:.1f} s, 95 % within "
                 f"{seconds['within_95']:.1f} s (n = {seconds['n']})")
@@ -298,7 +326,8 @@ class Tabletop:
 
 
 def _say(attempt: Attempt) -> None:
-    outcome = "held" if attempt.success else f"{attempt.stage}: {attempt.reason}"
+    done = "held" if attempt.place_error is None else "placed"
+    outcome = done if attempt.success else f"{attempt.stage}: {attempt.reason}"
     say_aside(f"{attempt.object}, attempt {attempt.number}: {outcome}")
 
 

@@ -209,7 +209,7 @@ def exported(hand: Hand, obj: ObjectModel, grasps: GraspBatch, kind: str) -> tup
         return f"{stem}.parquet", grasps.to_bytes()
     grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=grasps.joints.dtype))
     name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
-    content = form.content(ExportJob(grasps, Frame(), hand))
+    content = form.content(ExportJob(grasps, Frame(), hand, obj.name, obj=obj))
     return f"{stem}_{name}{form.suffix}", cast(bytes, content)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
-from dro_grasp.arm.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan
+from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.reachability import carried
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
@@ -45,14 +45,18 @@ class Film:
 
     @staticmethod
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:
-        """A plan as it is meant: the hand carries the object during the lift."""
+        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down."""
         points = list(plan.points(RATE))
         arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
         wrist = robot.T_world_wrist(arm)
-        lifting = np.array([p.stage == STAGES[-1] for p in points])
-        start = robot.T_world_wrist(plan.arm.position[plan.part(STAGES[-1])][0])
+        stage = np.array([ALL_STAGES.index(p.stage) for p in points])
+        lifts, releases = ALL_STAGES.index("lift"), ALL_STAGES.index("release")
+        start, held = robot.T_world_wrist(plan.arm.position[plan.part("lift")][0]), (stage >= lifts) & (stage < releases)
         poses = np.tile(np.eye(4), (len(points), 1, 1, 1))
-        poses[lifting, 0] = np.stack([carried(T, start) for T in wrist[lifting]])
+        poses[held, 0] = np.stack([carried(T, start) for T in wrist[held]])
+        if (stage >= releases).any():
+            end = robot.T_world_wrist(plan.arm.position[plan.part("lower")][-1])
+            poses[stage >= releases, 0] = carried(end, start)
         return Film(arm, hand, poses, plan)
 
     @staticmethod

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.grasps.export.writers import Frame
     from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class ExportJob:
     hand: Hand | None = None  # the grasps' hand, for formats that need it
     object_path: str = ""  # file or name of the object
     object_scale: float = 1.0  # scale of that file
+    obj: ObjectModel | None = None  # the object itself, for formats that show it
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class ExportFormat:
     suffix: str
     explanation: str  # what the files hold
     needs_hand: bool = False  # whether it writes more of the hand than its name
+    needs_object: bool = False  # whether it writes more of the object than its file's name
     file_per_grasp: bool = False  # whether an object becomes a folder with one file per grasp
 
     def content(self, job: ExportJob) -> bytes | list[bytes]:
@@ -46,5 +49,7 @@ FORMATS = {
     "dexgraspbench": ExportFormat(
         "dexgraspbench", "DexGraspBench (NPY)", ".npy", "one npy file per grasp, in a folder", file_per_grasp=True),
     "csv": ExportFormat("csv", "table (CSV)", ".csv", "one line per grasp"),
+    "usd": ExportFormat(
+        "usd", "USD stage", ".usd", "object, hand and grasps as a USD stage (extra `usd`)", needs_hand=True, needs_object=True),
 }
 """All formats, in the order of lists of choices."""

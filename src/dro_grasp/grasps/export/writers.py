@@ -22,6 +22,7 @@ from dro_grasp.grasps import columns
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
+from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation
 from dro_grasp.grasps.sources import camera_pose, frame_of
 from dro_grasp.hands.hand import Hand
 
@@ -121,6 +122,12 @@ def forces(grasps: GraspBatch, i: int) -> dict[str, float]:
             if bool((column := getattr(grasps, name))[i].isfinite())}
 
 
+def hold(grasps: GraspBatch, i: int) -> dict[str, Float[Tensor, " n_dof"]]:
+    """Joints and efforts to expect of a grasp with the object in the hand and without, where `expect_hold` has found them."""
+    told = HoldExpectation.of(grasps, i) is not None
+    return {name: grasps.extra[name][i] for name in HOLD_COLUMNS[:4]} if told else {}
+
+
 def plain(values: Float[Tensor, " k"]) -> list[float]:
     """Numbers that read well: a ten-millionth is finer than any robot."""
     return [round(float(v), 7) for v in values]
@@ -146,9 +153,9 @@ and readers may rely on it."""
 def isaac_grasp(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str:
     """An isaac_grasp YAML file (version 1.0) of grasps of one object, with pregrasps.
 
-    Of forces the format knows nothing: `squeeze_cspace_position`, `squeeze_cspace_effort`, `payload` and `squeeze_force` are
-    further entries, which its readers hand on or skip. Source: documentation of isaac_grasp files in Isaac Sim (grasp editor)
-    and Isaac ROS.
+    Of forces the format knows nothing: `squeeze_cspace_position`, `squeeze_cspace_effort`, `payload`, `squeeze_force` and
+    what is expected of a hold (HOLD_COLUMNS) are further entries, which its readers hand on or skip. Source: documentation
+    of isaac_grasp files in Isaac Sim (grasp editor) and Isaac ROS.
     """
     position, quaternion = frame.place(grasps)
     joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
@@ -165,6 +172,7 @@ def isaac_grasp(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> s
         if (effort := efforts_of(efforts, i)) is not None:
             entries[f"grasp_{i}"] |= {"squeeze_cspace_position": dict(zip(names, plain(joints["squeeze"][i]), strict=True)),
                                       "squeeze_cspace_effort": dict(zip(names, plain(effort), strict=True))}
+        entries[f"grasp_{i}"] |= {name: dict(zip(names, plain(row), strict=True)) for name, row in hold(grasps, i).items()}
         entries[f"grasp_{i}"] |= forces(grasps, i)
     content = {"format": "isaac_grasp", "format_version": 1.0, "object_frame_link": frame.name_for(grasps),
                "gripper_frame_link": grasps.wrist_link, "grasps": entries}
@@ -236,7 +244,7 @@ def dexgraspbench(
     """One dictionary per grasp, as DexGraspBench reads it from a npy file.
 
     Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the pose of the object's file in their
-    frame, WXYZ as well. `squeeze_effort`, `payload` and `squeeze_force` are entries of ours, where they are known. Source:
+    frame, WXYZ as well. `squeeze_effort`, `payload`, `squeeze_force` and HOLD_COLUMNS are of ours, where known. Source:
     readme of DexGraspBench.
     """
     position, quaternion = frame.place(grasps)
@@ -256,6 +264,7 @@ def dexgraspbench(
         })
         if (effort := efforts_of(efforts, i)) is not None:
             found[-1]["squeeze_effort"] = effort.double().numpy()
+        found[-1] |= {name: row.double().numpy() for name, row in hold(grasps, i).items()}
     return found
 
 
@@ -266,7 +275,8 @@ def csv_table(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str
     text = io.StringIO()
     text.write(comment(grasps, frame))
     writer = csv.writer(text, lineterminator="\n")
-    names = [f"{posture}:{joint}" for posture in (*joints, "effort") for joint in grasps.joint_names]
+    told = HOLD_COLUMNS[:4] if all(name in grasps.extra for name in HOLD_COLUMNS) else ()
+    names = [f"{posture}:{joint}" for posture in (*joints, "effort", *told) for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
                      "robustness", "fingers_in_contact", *columns.CARRYING, *names])
     for i in range(len(grasps)):
@@ -275,6 +285,7 @@ def csv_table(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str
             int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
             *(_cell(getattr(grasps, name)[i]) for name in ("robustness", "fingers_in_contact", *columns.CARRYING)),
             *(value for values in joints.values() for value in plain(values[i])), *map(_cell, efforts[i]),
+            *(_cell(value) for name in told for value in grasps.extra[name][i]),
         ])
     return text.getvalue()
 
@@ -299,10 +310,17 @@ def _moveit_file(job: ExportJob) -> bytes:
     return moveit_grasps(job.grasps, job.hand, job.frame).encode()
 
 
+def _usd_file(job: ExportJob) -> bytes:
+    from dro_grasp.grasps.export.usd import usd_file  # it needs an extra
+
+    return usd_file(job)
+
+
 WRITERS: dict[str, Callable[[ExportJob], bytes | list[bytes]]] = {
     "isaac_grasp": lambda job: isaac_grasp(job.grasps, job.frame, job.hand).encode(),
     "moveit": _moveit_file,
     "dexgraspbench": _dexgraspbench_files,
     "csv": lambda job: csv_table(job.grasps, job.frame, job.hand).encode(),
+    "usd": _usd_file,
 }
 """What makes one object's file, or one file per grasp, by the format's name."""

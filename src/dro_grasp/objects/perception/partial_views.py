@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from torch import Tensor
@@ -17,6 +17,7 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.perception.completion import complete_cloud
+from dro_grasp.objects.perception.depth_noise import DepthView, NoiseName, depth_noise, measured_depth
 from dro_grasp.objects.reading import numbers
 from dro_grasp.objects.shape import ObjectModel
 
@@ -67,8 +68,9 @@ class DepthCamera(Checked):
     """From the camera to the object's middle [m]."""
     pixel: float = 0.0015
     """Size of a pixel at that distance [m]; that of a 640-pixel camera with a field of view of 87 degrees."""
-    noise: float = 0.001
-    """Standard deviation of depth along the ray at half a metre [m]; it grows with the square of depth."""
+    noise: float | NoiseName = "stereo"
+    """Noise of depth: that of a kind of camera, or its standard deviation at half a metre, which grows with the square of depth
+    [m]. Of a bare cloud, which has no image, a kind of camera gives independent noise alone."""
     lost: float = 0.0
     """Share of pixels that return nothing."""
     grazing: float = 0.17
@@ -77,9 +79,10 @@ class DepthCamera(Checked):
     def __post_init__(self) -> None:
         """Refuse impossible settings."""
         super().__post_init__()
-        if min(self.distance, self.pixel) <= 0 or self.noise < 0 or not 0 <= self.lost < 1:
-            raise OptionError(f"{self} is no possible camera: distance and pixel must be positive, noise at least 0, and lost "
-                              "at least 0 and below 1")
+        depth_noise(self.noise)
+        if min(self.distance, self.pixel) <= 0 or not 0 <= self.lost < 1:
+            raise OptionError(f"{self} is no possible camera: distance and pixel must be positive, and lost at least 0 and "
+                              "below 1")
 
     def place(self, obj: ObjectModel, direction: Float[Tensor, "3"]) -> Float[np.ndarray, "3"]:
         """Position in the object's frame for a view from a direction of any length [m]."""
@@ -114,11 +117,10 @@ def visible_points(
         raise OptionError(f"a camera at {camera.distance:g} m is inside the object, {radius:.3g} m in radius; "
                           "move it away")
     T_object_camera = _looking_at(_middle(obj), towards.double().numpy() / length, camera.distance)
-    image = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
-    rays, depth = image(obj, T_object_camera, radius, camera)
-    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
-    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / 0.5) ** 2
-    points = (rays * (depth + error)[:, None])[kept]
+    hits = (_hits_of_cloud if obj.is_cloud else _hits_of_mesh)(obj, T_object_camera, radius, camera)
+    kept = torch.rand(len(hits.depth), generator=generator).numpy() >= camera.lost
+    measured = _measured(hits, camera, generator)
+    points = (hits.rays * measured[:, None])[kept & (measured > 0)]
     return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))
 
 
@@ -138,10 +140,37 @@ def _looking_at(middle: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"],
     return pose
 
 
-def _depth_of_mesh(
+class _Hits(NamedTuple):
+    """Where rays meet an object, in the camera's frame."""
+
+    rays: Float[np.ndarray, "n 3"]  # Directions with z = 1
+    depth: Float[np.ndarray, " n"]  # Along z [m]
+    normals: Float[np.ndarray, "n 3"]
+    pixel: Int[np.ndarray, "2 n"]  # Row and column
+    intrinsics: Float[np.ndarray, "3 3"] | None  # Of the image [pixels]; None if there is no image
+
+
+def _measured(hits: _Hits, camera: DepthCamera, generator: torch.Generator) -> Float[np.ndarray, " n"]:
+    """Depths with noise [m]; 0 where nothing is returned."""
+    drawn = torch.randn(len(hits.depth), generator=generator).numpy()
+    if not isinstance(camera.noise, str):
+        return hits.depth + drawn * camera.noise * (hits.depth / 0.5) ** 2
+    noise, seed = depth_noise(camera.noise), int(torch.randint(2**31, (), generator=generator))
+    if hits.intrinsics is None:
+        cosine = np.abs((hits.rays * hits.normals).sum(1)) / np.linalg.norm(hits.rays, axis=1)
+        angle = np.arccos(np.clip(cosine, 0, 1))
+        return np.where(angle < noise.steep[1], hits.depth + drawn * noise.deviation(hits.depth, angle), 0.0)
+    row, column = hits.pixel
+    image = np.zeros((int(row.max(initial=0)) + 1, int(column.max(initial=0)) + 1))
+    normals = np.zeros((*image.shape, 3))
+    image[row, column], normals[row, column] = hits.depth, hits.normals
+    return measured_depth(DepthView(image, normals, hits.intrinsics), noise, seed)[row, column]
+
+
+def _hits_of_mesh(
     obj: ObjectModel, T_object_camera: Float[np.ndarray, "4 4"], radius: float, camera: DepthCamera
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Ray directions with z = 1 in the camera's frame, and the depth along z of their first hits [m]."""
+) -> _Hits:
+    """First hits of the rays of a square image."""
     mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
     # At the distance of its middle, a sphere's silhouette is wider than the sphere.
     reach = camera.distance * radius / np.sqrt(camera.distance**2 - radius**2)
@@ -152,13 +181,17 @@ def _depth_of_mesh(
     hits, ray, face = mesh.ray.intersects_location(np.tile(place, (len(rays), 1)), towards, multiple_hits=False)
     cosine = np.abs((mesh.face_normals[face] * towards[ray]).sum(1)) / np.linalg.norm(towards[ray], axis=1)
     kept = cosine > np.sin(camera.grazing)
-    return rays[ray[kept]], ((hits - place) @ rotation[:, 2])[kept]
+    focal = camera.distance / camera.pixel
+    return _Hits(
+        rays[ray[kept]], ((hits - place) @ rotation[:, 2])[kept], mesh.face_normals[face[kept]] @ rotation,
+        np.stack([ray[kept] % len(side), ray[kept] // len(side)]),  # x is the first axis of the grid
+        np.array([[focal, 0, -focal * side[0]], [0, focal, -focal * side[0]], [0, 0, 1]]))
 
 
-def _depth_of_cloud(
+def _hits_of_cloud(
     obj: ObjectModel, T_object_camera: Float[np.ndarray, "4 4"], radius: float, camera: DepthCamera
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Like `_depth_of_mesh`, for the points that no others hide. Source: Katz, Tal and Basri 2007."""
+) -> _Hits:
+    """The points that no others hide, without an image. Source: Katz, Tal and Basri 2007."""
     # Reflect every point in a sphere about the camera: it is visible exactly if its image lies on the convex hull of all images
     # and the camera.
     local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
@@ -166,5 +199,6 @@ def _depth_of_cloud(
     radius = 300.0 * away.max()  # (ours): a larger sphere sees more, a smaller one hides more
     flipped = local + 2 * (radius - away) * local / away
     hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ").vertices
-    visible = local[np.sort(hull[hull < len(local)])]
-    return visible / visible[:, 2:], visible[:, 2]
+    seen = np.sort(hull[hull < len(local)])
+    visible, normals = local[seen], obj.cloud_normals[seen].astype(np.float64) @ T_object_camera[:3, :3]
+    return _Hits(visible / visible[:, 2:], visible[:, 2], normals, np.zeros((2, len(seen)), int), None)

@@ -1,0 +1,153 @@
+"""`dro-grasp clear`: a robot clears its table into a bin, in simulation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_json, print_table, say, say_aside
+
+if TYPE_CHECKING:
+    from dro_grasp.arm.clearing import Pick
+    from dro_grasp.arm.clearing_trial import ClearTrialConfig
+
+
+@dataclass(frozen=True)
+class Clear:
+    """Let a robot clear its table into a bin, one thing after the other, in MuJoCo. Needs the extra `[arm]`.
+
+    It looks, picks what has most room, checks by its joints whether it holds, drops it into the bin, and looks again.
+
+    Example: dro-grasp clear --robot xarm7_leaphand --objects mug can bottle --output tables.jsonl --video clear.webp
+    """
+
+    robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
+    objects: tuple[str, ...]  # Names or files of meshes, or groups such as builtin:train, of which each table is drawn.
+    things: Annotated[int | None, optional("INT", "all")] = None  # How many stand on a table.
+    tables: int = 1  # How many tables are cleared.
+    bin: Annotated[
+        tuple[float, float, float, float, float] | None, optional("X Y LX LY HEIGHT", "0.3 0.5 0.36 0.3 0.08")] = None
+    """Middle and extents of the bin, and the height of its walls, in the world [m]."""
+    tries: int = 3  # Picks of a thing that may fail before it is given up.
+    num: int = 24  # Grasps to choose from, in each of up to three batches.
+    rehearsals: int = 8  # Grasps of each batch whose lift is simulated on the object as it is known; 0 for none.
+    seed: int = 0  # Seed of all draws.
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
+    output: Annotated[Path | None, optional("JSONL", "not saved")] = None
+    """File for a line a table. A rerun repeats no table that it holds with the same robot, objects, weights, settings and
+    seed."""
+    video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None  # Animation of the first table, which is cleared for it.
+    json: Flag = False  # Print one JSON object instead of text.
+
+    def run(self) -> int:
+        """Clear what is missing, store and print."""
+        from dro_grasp.arm.animation import FORMATS, Recorder, draw_animation
+        from dro_grasp.arm.clearing_trial import clear_trial
+        from dro_grasp.arm.robot import load_robot
+        from dro_grasp.errors import OptionError
+        from dro_grasp.extras import require_extra
+        from dro_grasp.files import check_output
+        from dro_grasp.network.checkpoints import describe_weights
+        from dro_grasp.objects.catalogue import load_object, resolve_objects
+        from dro_grasp.predict.predictor import GraspPredictor
+
+        require_extra("arm")
+        if self.video is not None:
+            check_output(self.video, *FORMATS)
+        if self.output is not None:
+            check_output(self.output, ".jsonl")
+        names = resolve_objects(list(self.objects))
+        count = len(names) if self.things is None else self.things
+        if self.tables < 1 or not 1 <= count <= len(names):
+            raise OptionError(f"{self.tables} tables of {count} things are asked for, of {len(names)} objects; give at least "
+                              "one table, and no more things than objects")
+        config, robot = self._config(), load_robot(self.robot)
+        key = {"robot": robot.sha256, "objects": [load_object(name).sha256 for name in names], "things": count,
+               "seed": self.seed, "weights": describe_weights(self.weights)["sha256"], "settings": asdict(config)}
+        known = _read(self.output, json.loads(json.dumps(key)))
+        predictor = GraspPredictor(self.weights)
+        done = list[dict[str, Any]]()
+        for number in range(self.tables):
+            if number not in known or (self.video is not None and number == 0):
+                recorder = Recorder() if self.video is not None and number == 0 else None
+                drawn = [load_object(names[i]) for i in _drawn(len(names), count, self.seed, number)]
+                made = clear_trial(robot, drawn, number, self.seed, predictor, config, recorder, None if self.json else _say)
+                known[number] = asdict(made)
+                _append(self.output, {"table": number, **asdict(made), "key": key})
+                if recorder is not None and self.video is not None:
+                    draw_animation(robot, recorder, self.video)
+                    say_aside(f"video: {self.video}")
+            done.append(known[number])
+        self._report(done)
+        return 0
+
+    def _config(self) -> ClearTrialConfig:
+        from dro_grasp.arm.clearing import Bin, ClearConfig
+        from dro_grasp.arm.clearing_trial import ClearTrialConfig
+        from dro_grasp.arm.planner import PlanConfig
+
+        box = Bin() if self.bin is None else Bin(self.bin[:2], self.bin[2:4], self.bin[4])
+        return ClearTrialConfig(clear=ClearConfig(box, self.tries, plan=PlanConfig(self.num, rehearsals=self.rehearsals)))
+
+    def _report(self, done: list[dict[str, Any]]) -> None:
+        from dro_grasp.compare.metrics import wilson_interval
+
+        things = sum(len(table["objects"]) for table in done)
+        removed, picks = sum(sum(table["removed"]) for table in done), sum(len(table["cleared"]["picks"]) for table in done)
+        judged = [(state == "held", held) for table in done for state, held in table["judgements"]]
+        right = sum(said == held for said, held in judged)
+        low, high = wilson_interval(removed, things)
+        if self.json:
+            print_json({"tables": len(done), "things": things, "removed": removed, "interval": [low, high], "picks": picks,
+                        "judgements": len(judged), "right": right, "results": done})
+            return
+        rows = [[i, f"{sum(table['removed'])} of {len(table['objects'])}", len(table["cleared"]["picks"]),
+                 "; ".join(pick["reason"] for pick in table["cleared"]["left"])[:120] or table["reason"]]
+                for i, table in enumerate(done)]
+        print_table("tables", ["table", "removed", "picks", "given up because"], rows)
+        say(f"{removed} of {things} things removed ({removed / things:.0%}, 95 % interval {low:.0%} to {high:.0%})"
+            + (f", with {picks / removed:.2f} picks each" if removed else ""))
+        if judged:
+            low, high = wilson_interval(right, len(judged))
+            say(f"whether it holds: {right} of {len(judged)} judgements are right ({right / len(judged):.0%}, 95 % interval "
+                f"{low:.0%} to {high:.0%})")
+        if self.output is not None:
+            say(f"tables: {self.output}")
+
+
+def _drawn(total: int, count: int, seed: int, number: int) -> list[int]:
+    """Which objects stand on a table."""
+    import numpy as np
+
+    return np.random.default_rng([seed, number, 7]).permutation(total)[:count].tolist()
+
+
+def _read(path: Path | None, key: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """Tables of the same key in a file, by number."""
+    from dro_grasp.errors import GraspFileError
+    from dro_grasp.files import UNTYPED, reading
+
+    if path is None or not path.exists():
+        return {}
+    with reading(path, GraspFileError, "a file of cleared tables (.jsonl); name another one, or move this one away", *UNTYPED):
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return {line["table"]: line for line in lines if line["key"] == key}
+
+
+def _append(path: Path | None, line: dict[str, Any]) -> None:
+    from dro_grasp.files import replacing
+
+    if path is None:
+        return
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    with replacing(path, "tables") as temporary:
+        temporary.write_text(before + json.dumps(line) + "\n", encoding="utf-8")
+
+
+def _say(pick: Pick) -> None:
+    x, y = pick.place
+    say_aside(f"thing at ({x:.2f}, {y:.2f}) m: {'in the bin' if not pick.reason else f'{pick.stage}: {pick.reason}'}")

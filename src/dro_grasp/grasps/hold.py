@@ -1,0 +1,155 @@
+"""Did it hold? What a robot's joints say after the hand has closed and lifted: held, empty, or slipping.
+
+Fingers that close on an object stop where it is, and press; fingers that close on nothing go on to their targets. Both ends are
+known from closings in simulation (`expect_hold`). Ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.special import logsumexp
+
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
+
+HOLD_COLUMNS = ("held_joints", "held_torque", "empty_joints", "empty_torque", "hold_unit")
+"""Further columns of a batch: joints [rad or m] and efforts [Nm or N] with the object in the hand and without, and what counts
+as a radian to each joint: 1, or a length where it slides [m]."""
+HoldState = Literal["held", "empty", "slipping"]
+STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")  # In the order of HoldConfig.priors
+STEPS = 10  # Shares of the way that are tried for a slipping object (ours)
+
+
+@dataclass(frozen=True, eq=False)
+class HoldExpectation:
+    """Where independent joints should be once the hand has squeezed, and what they should exert."""
+
+    held_joints: Float[np.ndarray, " n_dof"]
+    """With the object in the hand [rad or m]."""
+    held_efforts: Float[np.ndarray, " n_dof"]
+    """Likewise [Nm or N]."""
+    empty_joints: Float[np.ndarray, " n_dof"]
+    """With nothing in the hand [rad or m]."""
+    empty_efforts: Float[np.ndarray, " n_dof"]
+    """Likewise [Nm or N]."""
+    unit: Float[np.ndarray, " n_dof"]
+    """What counts as a radian: 1, or a length where a joint slides [m]."""
+
+    @staticmethod
+    def of(grasps: GraspBatch, index: int) -> HoldExpectation | None:
+        """Those of one grasp; None where `expect_hold` has not been asked."""
+        if not all(name in grasps.extra for name in HOLD_COLUMNS):
+            return None
+        rows = [grasps.extra[name][index].double().numpy() for name in HOLD_COLUMNS]
+        return HoldExpectation(*rows) if all(np.isfinite(row).all() for row in rows) else None
+
+
+@dataclass(frozen=True)
+class HoldConfig(Checked):
+    """How far measurements may be from what is expected. Values are ours, from closings of training objects."""
+
+    encoder: float = 0.02
+    """Standard deviation of measured joints, and of where an empty hand stops [rad, or a share of a sliding joint's unit]."""
+    sensor: float = 0.1
+    """Standard deviation of measured efforts, as a share of the largest expected one [1]."""
+    spread: float = 0.35
+    """Standard deviation of where fingers stop on the object, as a share of the way from there to where an empty hand does."""
+    slip: tuple[float, float] = (0.15, 0.9)
+    """Shares of the way from where they were to the empty hand's joints that fingers have gone when an object slips [1]."""
+    priors: tuple[float, float, float] = (0.48, 0.48, 0.04)
+    """Probabilities of held, empty and slipping before anything is measured."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no spread and no probability.
+
+        Raises:
+            OptionError: A spread is not above 0, or a probability not between 0 and 1.
+        """
+        super().__post_init__()
+        if not all(0 < size < math.inf for size in (self.encoder, self.sensor, self.spread)):
+            raise OptionError(f"encoder, sensor and spread are {self.encoder}, {self.sensor} and {self.spread}; give numbers "
+                              "above 0")
+        if not all(0 < prior < 1 for prior in self.priors):
+            raise OptionError(f"priors are {self.priors}; give three probabilities between 0 and 1")
+
+
+@dataclass(frozen=True)
+class HoldCheck:
+    """What the joints say."""
+
+    state: HoldState
+    """The most probable state."""
+    confidence: float
+    """Its probability."""
+    probabilities: dict[str, float]
+    """Those of all states."""
+
+
+def check_hold(
+    expected: HoldExpectation, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *,
+    before: ArrayLike | None = None, config: HoldConfig | None = None,
+) -> HoldCheck:
+    """Compare measured joints, and efforts if there are any, with those that are expected with the object and without.
+
+    Measure once the hand has squeezed, and again after the lift. Where joints end at the same place with the object and
+    without, the confidence is low, and efforts are needed.
+
+    Args:
+        expected: What to expect, of a plan (`MotionPlan.hold`) or of grasps (`HoldExpectation.of`).
+        measured_joints: Independent joints of the hand, in its order, (n_dof) [rad or m].
+        measured_efforts: What they exert, likewise [Nm or N], positive toward larger values.
+        before: Joints as they were measured while the object was held, likewise: how they moved since shows that it slips.
+        config: Spreads.
+
+    Raises:
+        OptionError: Measurements have another shape, or are not finite.
+    """
+    config, size = config or HoldConfig(), len(expected.held_joints)
+    joints, held = _measured("measured_joints", measured_joints, size), expected.held_joints
+    noise, start = config.encoder * expected.unit, None if before is None else _measured("before", before, size)
+    total = _log_likelihoods(joints, held, expected.empty_joints, noise, start, config)
+    if measured_efforts is not None:
+        efforts = _measured("measured_efforts", measured_efforts, size)
+        noise = np.full(size, config.sensor * max(float(np.abs(expected.held_efforts).max()), 1e-9))
+        total = total + _log_likelihoods(efforts, expected.held_efforts, expected.empty_efforts, noise, None, config)
+    slipping = logsumexp(total[2:]) - math.log(len(total) - 2)
+    odds = np.array([total[0], total[1], slipping]) + np.log(config.priors)
+    chances = np.exp(odds - logsumexp(odds)).tolist()
+    best = max(range(len(STATES)), key=chances.__getitem__)
+    return HoldCheck(STATES[best], chances[best], dict(zip(STATES, chances, strict=True)))
+
+
+def _measured(name: str, given: ArrayLike, size: int) -> Float[np.ndarray, " n_dof"]:
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"{name} is no row of numbers ({error}); give one for each of the hand's {size} joints") from error
+    if values.shape != (size,) or not np.isfinite(values).all():
+        raise OptionError(f"{name} is {values.tolist()}; give one finite number for each of the hand's {size} joints")
+    return values
+
+
+def _log_likelihoods(
+    measured: Float[np.ndarray, " n"], held: Float[np.ndarray, " n"], empty: Float[np.ndarray, " n"],
+    noise: Float[np.ndarray, " n"], before: Float[np.ndarray, " n"] | None, config: HoldConfig,
+) -> Float[np.ndarray, " k"]:
+    """Of held, of empty, and of slipping by some shares of the way, from rows of one number for each joint.
+
+    Fingers that hold stop each by itself, some way off the expected place, and stay there; those of an empty hand are where
+    they should be; and those from which an object slips have gone some way together.
+    """
+    start = held if before is None else before
+    way = empty - start
+    loose = np.hypot(noise, config.spread * (empty - held))
+    still = loose if before is None else np.hypot(math.sqrt(2) * noise, 0.1 * way)
+    moving = np.hypot(noise, config.spread / 2 * way)
+    places = [(start, still), (empty, noise), *((start + share * way, moving) for share in np.linspace(*config.slip, STEPS))]
+    errors, spreads = (np.stack(rows) for rows in zip(*((measured - place, spread) for place, spread in places), strict=True))
+    return -((errors / spreads) ** 2 / 2 + np.log(spreads)).sum(1)

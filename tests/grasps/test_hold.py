@@ -1,0 +1,75 @@
+"""Held, empty or slipping, by joints of which everything is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.hold import HoldConfig, HoldExpectation, check_hold
+
+EXPECTED = HoldExpectation(
+    np.array([0.5, 0.6, 0.4, 0.02]), np.array([0.3, 0.2, 0.25, 8.0]), np.array([0.8, 0.9, 0.55, 0.0]), np.zeros(4),
+    np.array([1.0, 1.0, 1.0, 0.05]))
+
+
+def between(share: float) -> np.ndarray:
+    return EXPECTED.held_joints + share * (EXPECTED.empty_joints - EXPECTED.held_joints)
+
+
+def test_the_ends_are_told_apart_and_surely() -> None:
+    for share, state in ((0.0, "held"), (-0.3, "held"), (1.0, "empty")):
+        found = check_hold(EXPECTED, between(share))
+        assert (found.state, found.confidence > 0.9) == (state, True), share
+        assert sum(found.probabilities.values()) == pytest.approx(1)
+        assert found.confidence == found.probabilities[state]
+
+
+def test_noise_of_encoders_changes_nothing() -> None:
+    rng = np.random.default_rng(0)
+    for share, state in ((0.0, "held"), (1.0, "empty")):
+        noisy = between(share) + 0.01 * EXPECTED.unit * rng.normal(size=(200, 4))
+        assert sum(check_hold(EXPECTED, row).state == state for row in noisy) == 200
+
+
+def test_fingers_that_move_on_together_let_the_object_slip() -> None:
+    held = between(0.1)
+    assert check_hold(EXPECTED, between(0.12), before=held).state == "held"
+    assert check_hold(EXPECTED, between(0.6), before=held).state == "slipping"
+    assert check_hold(EXPECTED, between(1.0), before=held).state == "empty"
+
+
+def test_the_more_open_hand_holds_something_larger() -> None:
+    larger = between(-0.5)
+    assert check_hold(EXPECTED, larger).state == "held"
+    assert check_hold(EXPECTED, larger, before=larger).state == "held"
+
+
+def test_joints_that_end_at_the_same_place_say_little_and_efforts_decide() -> None:
+    blind = HoldExpectation(
+        EXPECTED.held_joints, EXPECTED.held_efforts, EXPECTED.held_joints + 1e-3 * EXPECTED.unit, np.zeros(4), EXPECTED.unit)
+    assert check_hold(blind, blind.held_joints).confidence < 0.6
+    assert check_hold(blind, blind.held_joints, blind.held_efforts).state == "held"
+    pressing = check_hold(blind, blind.held_joints, blind.held_efforts)
+    idle = check_hold(blind, blind.held_joints, np.zeros(4))
+    assert (pressing.state, idle.state) == ("held", "empty")
+    assert min(pressing.confidence, idle.confidence) > 0.9
+
+
+def test_a_sliding_joint_counts_by_its_own_unit() -> None:
+    """Two centimetres are a long way for a jaw, and nothing in radians."""
+    jaw = HoldExpectation(np.array([0.02]), np.array([20.0]), np.array([0.0]), np.array([0.0]), np.array([0.05]))
+    assert check_hold(jaw, [0.019]).state == "held"
+    assert check_hold(jaw, [0.0]).state == "empty"
+    assert check_hold(jaw, [0.0]).confidence > 0.9
+
+
+def test_measurements_that_do_not_fit_are_refused() -> None:
+    for wrong in ([0.5, 0.6], [0.5, 0.6, 0.4, float("nan")], "open", [[0.5, 0.6, 0.4, 0.02]]):
+        with pytest.raises(OptionError, match="hand's 4 joints"):
+            check_hold(EXPECTED, wrong)
+        with pytest.raises(OptionError, match=r"measured_efforts.*hand's 4 joints"):
+            check_hold(EXPECTED, EXPECTED.held_joints, wrong)
+    for settings in ({"encoder": 0.0}, {"spread": -1.0}, {"priors": (1.0, 0.0, 0.0)}):
+        with pytest.raises(OptionError, match="give"):
+            HoldConfig(**settings)
