@@ -35,7 +35,8 @@ from .network.presets import NetworkConfig as NetworkConfig
 from .objects.catalogue import load_object as load_object, object_names as object_names
 from .objects.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from .objects.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-from .objects.scenery import Scene as Scene, load_scene as load_scene
+from .objects.perception.scene_files import SceneCamera as SceneCamera
+from .objects.scenery import FoundObject as FoundObject, Scene as Scene, load_scene as load_scene
 from .objects.shape import ObjectModel as ObjectModel
 from .optimize.fingers import ClosingConfig as ClosingConfig
 from .optimize.refinement import RefineConfig as RefineConfig
