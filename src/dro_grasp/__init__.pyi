@@ -42,6 +42,7 @@ from .optimize.fingers import ClosingConfig as ClosingConfig
 from .optimize.refinement import RefineConfig as RefineConfig
 from .optimize.squeeze import GripConfig as GripConfig
 from .optimize.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
+from .pictures.scene import draw_scene as draw_scene
 from .pictures.sheets import PictureStyle as PictureStyle, draw_grasps as draw_grasps
 from .predict.config import (
     GraspRequest as GraspRequest,

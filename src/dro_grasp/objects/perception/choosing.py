@@ -21,6 +21,7 @@ ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
 BORDER = 3  # Pixels from the image's border that touch it (ours)
 EDGE = 0.01  # The same of a cloud, as a share of its width [1] (ours)
 TOLD = 8  # Things that a message lists (ours)
+ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
 PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
 LEAST_MASK = 60  # Fewest points in a mask (ours)
 
@@ -89,8 +90,8 @@ def choose(
     elif segments.count == 1:
         number = 0
     else:
-        raise ObjectError(f"'{name}' shows {segments.count} things ({listed(sight, segments)}); say which is meant: a place on "
-                          "it (at=(X, Y, Z)), a pixel (pixel=(U, V)), a mask, or nearest")
+        raise ObjectError(f"'{name}' shows {segments.count} things ({listed(sight, segments)}); say which is meant: by a place "
+                          "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or the one nearest to the camera (nearest=True)")
     own = np.flatnonzero(segments.labels == number)
     seam = ("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If so, give the "
             "pixels of the one that is meant as a mask",) if segments.seams[number] else ()
@@ -220,7 +221,8 @@ def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes:
     avoided = (labels != NOTHING) & ~taken
     if below is not None:
         plane = segments.planes[below]
-        avoided &= np.abs(sight.points @ plane[:3] - plane[3]) > 0.02  # [m] (ours): hands stay above it by another way
+        # Hands stay above the table by another way.
+        avoided &= (labels >= 0) | (np.abs(sight.points @ plane[:3] - plane[3]) > ON_TABLE)
     return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
 
 

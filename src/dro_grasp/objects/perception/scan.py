@@ -27,7 +27,7 @@ from dro_grasp.objects.loading import (
     table_note,
 )
 from dro_grasp.objects.perception.completion import complete_cloud
-from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.perception.things import one_thing, refuse_scene
 from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -193,7 +193,7 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     told = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
     rows = rows[there]
     rows = rows[distinct_points(rows[:, :3])]
-    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
+    whole, total, table = rows[:, :3], len(rows), None if keep_table else table_plane(rows[:, :3], camera)
     if table is not None:
         rows = rows[above_plane(rows[:, :3], table)]
     cut = total - len(rows)
@@ -207,6 +207,8 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     if len(rows) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
     check_view(rows[:, :3], name)
+    if not keep_table:
+        refuse_scene(whole, rows[:, :3], name)
     middle = rows[:, :3].mean(0)
     if float((rows[:, :3] @ middle).min()) <= LEAST_DEPTH * float(middle @ middle):
         raise ObjectError(f"{name} has points behind or beside the camera, which is at the cloud's origin; give the cloud in "

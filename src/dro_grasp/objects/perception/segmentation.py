@@ -270,7 +270,8 @@ def _is_other(cells: Float[np.ndarray, "k 3"], levels: list[Float[np.ndarray, "4
     longest = float(np.ptp(cells, axis=0).max())
     if longest > LONGEST_THING or (levels and max(float(np.median(_over(cells, plane))) for plane in levels) < 0):
         return True
-    if longest <= LONGEST_FACE:
+    over = [low for plane in levels if (low := float(np.quantile(_over(cells, plane), 0.02))) > 0]
+    if longest <= (LEAST_WALL if over and min(over) > FLOATS else LONGEST_FACE):
         return False
     fit = largest_plane(cells, NEAR)
     return fit is not None and float((np.abs(_over(cells, fit)) < MOST_THICK).mean()) > 0.85
@@ -321,7 +322,9 @@ def _take_fragments(cells: Float[np.ndarray, "r 3"], labels: Int[np.ndarray, " r
 def _has_seam(
     view: _View, rest: Int[np.ndarray, " r"], own: Int[np.ndarray, " o"], pairs: Int[np.ndarray, "p 2"]
 ) -> bool:
-    """Whether a thing falls into two large parts where its surface turns inward."""
+    """Whether a thing falls into two large parts where its surface turns inward; unknown without a camera's place."""
+    if view.camera is None:
+        return False
     place = np.full(len(rest), -1)
     place[own] = np.arange(len(own))
     mine = place[pairs[(place[pairs] >= 0).all(1)]]
