@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -84,7 +84,7 @@ def render_scene(
     """The same with given meshes."""
     room, _, places = _rooms(place)
     parts = [*meshes, *room]
-    whole = trimesh.util.concatenate(parts)
+    whole: Any = trimesh.util.concatenate(parts)
     owner = np.repeat([*range(len(meshes)), *[-1] * len(room)], [len(m.faces) for m in parts])
     position = np.array(places[3 * view : 3 * view + 3])
     T = looking(position, np.array([0.0, 0.03, 0.05]))
@@ -113,16 +113,16 @@ def _scattered(
             break
         name = TRAINING[rng.integers(len(TRAINING))]
         obj = load_object(name)
-        extents = obj.vertices.max(0) - obj.vertices.min(0)
+        vertices = np.asarray(obj.vertices, np.float64)
+        low, high = vertices.min(0), vertices.max(0)
+        extents, centre = high - low, (low + high) / 2
         if extents.max() > 0.3 or extents.min() < 0.025 or extents[2] > tallest:
             continue
         angle, middle = rng.uniform(0, 2 * np.pi), rng.uniform(region[:2], region[2:])
-        radius = float(np.linalg.norm(obj.vertices[:, :2] - (obj.vertices[:, :2].max(0) + obj.vertices[:, :2].min(0)) / 2,
-                                      axis=1).max())
+        radius = float(np.linalg.norm(vertices[:, :2] - centre[:2], axis=1).max())
         if any(np.linalg.norm(middle - m) < radius + r + GAP for m, r in circles):
             continue
-        mesh = trimesh.Trimesh(obj.vertices - [*(obj.vertices[:, :2].max(0) + obj.vertices[:, :2].min(0)) / 2,
-                                               obj.vertices[:, 2].min()], obj.faces, process=False)
+        mesh = trimesh.Trimesh(vertices - [centre[0], centre[1], low[2]], obj.faces, process=False)
         mesh.apply_transform(trimesh.transformations.rotation_matrix(angle, [0, 0, 1]))
         mesh.apply_translation([*middle, 0.0])
         meshes.append(mesh)

@@ -37,7 +37,6 @@ class Generate:
     """Predict grasps of an object by a hand, evaluate them in simulation, and save them.
 
     Example: dro-grasp generate --hand allegro --object mug --output grasps.parquet --picture grasps.png
-    Example: dro-grasp generate --hand allegro --scene depth.png --camera camera.json --nearest --scene-picture scene.png
     """
 
     hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.

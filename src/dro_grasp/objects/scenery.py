@@ -21,7 +21,14 @@ from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
 from dro_grasp.objects.perception.choosing import Chosen, Sight, choose
-from dro_grasp.objects.perception.scene_files import SceneCamera, as_camera, is_depth, read_depth, sight_of_cloud, sight_of_depth
+from dro_grasp.objects.perception.scene_files import (
+    SceneCamera,
+    as_camera,
+    is_depth,
+    read_depth,
+    sight_of_cloud,
+    sight_of_depth,
+)
 from dro_grasp.objects.perception.segmentation import Segments, segment
 from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
@@ -77,8 +84,8 @@ class Scene:
             ObjectError: The scene is a mesh.
         """
         if self.sight is None:
-            raise ObjectError(f"the scene '{self.name}' is a mesh; give what a camera saw, a cloud or a depth image, to take one "
-                              "object out of it, or the object's own mesh")
+            raise ObjectError(f"the scene '{self.name}' is a mesh; give what a camera saw, a cloud or a depth image, to take "
+                              "one object out of it, or the object's own mesh")
         return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
 
     def chosen(
@@ -181,8 +188,8 @@ def load_scene(
     if isinstance(source, str | Path):
         path = given_path(source)
         if not path.is_file():
-            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD), or what a "
-                              "camera saw (also PNG, TIFF)")
+            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD), or what "
+                              "a camera saw (also PNG, TIFF)")
         label, origin = name or path.stem, str(path)
         if is_depth(path):
             return _seen(label, sight_of_depth(read_depth(path, seen_by), seen_by, scale, origin))
@@ -193,7 +200,8 @@ def load_scene(
             return _seen(label, sight_of_depth(np.asarray(source), seen_by, scale, origin))
     if isinstance(geometry, trimesh.Trimesh):
         if seen_by is not None:
-            raise ObjectError(f"{origin} is a mesh, and no camera sees one; give its cloud or depth image, or leave out the camera")
+            raise ObjectError(f"{origin} is a mesh, and no camera sees one; give its cloud or depth image, or leave out the "
+                              "camera")
         return _of_mesh(label, geometry, origin, scale * unit)
     return _seen(label, sight_of_cloud(coordinates(geometry, origin) * (scale * unit), seen_by, _shape(geometry)), origin)
 

@@ -27,6 +27,7 @@ AROUND = 0.7  # Points farther than this from the object are not drawn [m] (ours
 ASIDE = 0.9  # Angle between the camera's view and the one from aside [rad] (ours)
 LEGENDS = (("the object", OBJECT_COLOUR), ("tables, boards, walls", STRUCTURE_COLOUR), ("obstacles", OBSTACLE_COLOUR),
            ("scattered: left out", STRAY_COLOUR), ("the camera", CAMERA_COLOUR))
+"""What the colours mean."""
 
 
 @checked

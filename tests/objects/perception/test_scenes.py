@@ -42,6 +42,7 @@ def test_each_object_is_found_by_its_place_and_all_else_is_avoided(place: str, s
     for k, chosen in enumerate(found):
         assert overlap(made, k, chosen.pixels) > WELL
         others = [i for i in range(len(found)) if i != k]
+        assert scene.sight is not None
         avoided = made.owner.ravel()[scene.sight.pixels[chosen.others]]
         for i in others:  # every other object is an obstacle
             assert (avoided == i).sum() > 0.9 * (made.owner == i).sum()
@@ -188,10 +189,10 @@ def test_a_scene_given_as_an_object_is_told_apart() -> None:
     y, z = np.meshgrid(np.arange(-0.3, 0.3, 0.004), np.arange(-0.4, 0.5, 0.004))
     wall = np.stack([np.full(y.size, 0.4), y.ravel(), z.ravel()], 1)
     room = np.concatenate([_table((0.0, 0.0), (-0.2, 0.1)), wall])
-    with pytest.raises(ObjectError, match=re.escape("is a scene, and no object") + ".*--scene FILE"):
+    with pytest.raises(ObjectError, match=re.escape("is a scene, and no object") + ".*scene=FILE"):
         load_object(room)
     camera = looking(np.array([-1.0, 0.0, 0.8]), np.zeros(3))
-    with pytest.raises(ObjectError, match="--scene FILE"):
+    with pytest.raises(ObjectError, match="scene=FILE"):
         scanned_object("room", (room - camera[:3, 3]) @ camera[:3, :3], camera)
     assert load_object(room, keep_table=True).is_cloud
 

@@ -79,8 +79,8 @@ def choose(
         own = _masked(name, sight, segments, mask)
         return _chosen(sight, segments, own, ())
     if not segments.count:
-        raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more and "
-                          f"at most 60 cm; look from nearer, or give the object's pixels as a mask")
+        raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
+                          "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
     if at is not None:
         number = _at(name, sight, segments, at)
     elif pixel is not None:
@@ -91,10 +91,11 @@ def choose(
         number = 0
     else:
         raise ObjectError(f"'{name}' shows {segments.count} things ({listed(sight, segments)}); say which is meant: by a place "
-                          "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or the one nearest to the camera (nearest=True)")
+                          "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or as the nearest to the "
+                          "camera (nearest=True)")
     own = np.flatnonzero(segments.labels == number)
-    seam = ("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If so, give the "
-            "pixels of the one that is meant as a mask",) if segments.seams[number] else ()
+    seam = ("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If so, give "
+            "the pixels of the one that is meant (mask=PNG)",) if segments.seams[number] else ()
     return _chosen(sight, segments, own, (*seam, *_beside(sight, segments, own)))
 
 
@@ -108,8 +109,8 @@ def _beside(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> tup
     other = np.flatnonzero(others)
     other = other[:: max(1, len(other) // 20000)]
     away = float(KDTree(sight.points[other]).query(sight.points[own])[0].min())
-    return (f"another thing, {1000 * away:.0f} mm beside it, counts as an obstacle. If it is a part of this one, give the pixels of "
-            "both as a mask",) if away < PART_OF else ()
+    return (f"another thing, {1000 * away:.0f} mm beside it, counts as an obstacle. If it is a part of this one, give the "
+            "pixels of both (mask=PNG)",) if away < PART_OF else ()
 
 
 def listed(sight: Sight, segments: Segments) -> str:
@@ -165,13 +166,13 @@ def _inside(
 def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Sequence[float]) -> int:
     image, wanted = sight.image(), numbers(pixel, "pixel").astype(np.float64)
     if image is None:
-        raise OptionError(f"a pixel is given, and '{name}' is a cloud without an image; state \"intrinsics\" in the camera's file, "
-                          "or give a place (at=(X, Y, Z))")
+        raise OptionError(f"a pixel is given, and '{name}' is a cloud without an image; state \"intrinsics\" in the camera's "
+                          "file, or give a place (at=(X, Y, Z))")
     if wanted.shape != (2,) or not np.isfinite(wanted).all():
         raise OptionError(f"pixel is {list(pixel)}; give its column and row")
     if sight.shape is not None and not ((wanted >= 0) & (wanted < sight.shape[::-1])).all():
-        raise OptionError(f"pixel is {wanted[0]:g} {wanted[1]:g}, beside the image of {sight.shape[1]} x {sight.shape[0]}; give "
-                          "its column and row, from the upper left")
+        raise OptionError(f"pixel is {wanted[0]:g} {wanted[1]:g}, beside the image of {sight.shape[1]} x {sight.shape[0]}; "
+                          "give its column and row, from the upper left")
     away = np.linalg.norm(image - wanted, axis=1)
     closest = int(away.argmin())
     if away[closest] > ASIDE:
@@ -196,8 +197,8 @@ def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.nd
     from dro_grasp.objects.perception.scene_files import read_mask
 
     if sight.shape is None:
-        raise OptionError(f"a mask is given, and '{name}' is a cloud without an image; give the depth image, an organised cloud "
-                          "(h, w, 3), or a place (at=(X, Y, Z))")
+        raise OptionError(f"a mask is given, and '{name}' is a cloud without an image; give the depth image, an organised "
+                          "cloud (h, w, 3), or a place (at=(X, Y, Z))")
     wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else numbers(mask, "the mask", "biuf") != 0
     if wanted.shape != sight.shape:
         raise ObjectError(f"the mask has shape {wanted.shape}, the image {sight.shape}; give one of the same size")

@@ -60,7 +60,8 @@ def as_camera(camera: SceneCamera | Path | str) -> SceneCamera:
         try:
             K = np.array(K, np.float64)
         except (ValueError, TypeError) as error:
-            raise OptionError(f"{path} has intrinsics that are no matrix ({error}); give 3 rows of 3 numbers, in pixels") from error
+            raise OptionError(f"{path} has intrinsics that are no matrix ({error}); give 3 rows of 3 numbers, in "
+                              "pixels") from error
         if K.shape != (3, 3):
             raise OptionError(f"{path} has intrinsics of shape {K.shape}; give 3 rows of 3 numbers, in pixels")
     return SceneCamera(motion.T.double().numpy(), K, motion.frame, None if unit is None else float(unit))

@@ -18,7 +18,8 @@ MOST_CELLS = 45_000  # Filled cubes above which they grow (ours): what two cores
 REACH = 1.5  # Points nearer to the camera than this count [m], and those up to twice the distance of the nearest (ours)
 NEIGHBOURS = 24  # Neighbours that estimate a normal (ours): about 12 mm around
 NEAR = 0.008  # Points at most this far from a plane are counted for it [m] (ours)
-LEAST_THICK, MOST_THICK = 0.006, 0.016  # Least and largest half thickness of a plane [m] (ours); between, 3 deviations
+LEAST_THICK = 0.006  # Least half thickness of a plane [m] (ours): three standard deviations of 2 mm
+MOST_THICK = 0.016  # Largest half thickness of a plane [m] (ours); between, three standard deviations of what was seen
 TILTED = 0.7  # Least cosine between a plane's normal and those of its points [1] (ours)
 MOST_PLANES = 12  # Planes that are tried (ours): a shelf has eight
 PATCH = 0.02  # Edge of the squares in which a plane's area is counted [m] (ours)
@@ -26,11 +27,13 @@ LEAST_AREA = 0.01  # Area from which a plane may be a wall [m^2] (ours)
 FIRST_AREA = 0.04  # Area from which the largest plane is what things stand on [m^2] (ours)
 CERTAIN_AREA = 0.1  # Area from which a plane is no side of a thing that a hand grasps [m^2] (ours)
 SPANS = 0.5  # Share of the largest plane's length that a smaller one beside it spans if it is a wall [1] (ours)
-LEAST_WALL, LEAST_BOARD = 0.25, 0.4  # Shortest diagonals of walls, and of boards along the largest plane [m] (ours)
+LEAST_WALL = 0.25  # Shortest diagonal of a wall [m] (ours)
+LEAST_BOARD = 0.4  # Shortest diagonal of a board along the largest plane [m] (ours)
 LEAST_BOARD_AREA = 0.03  # Least area of a board along the largest plane [m^2] (ours)
 LONGEST_FACE = 0.35  # Longest thing that is all one plane: what is longer is a wall seen from outside [m] (ours)
-FLOATS, GAP = 0.04, 0.06
-"""Height above every plane from which a thing floats, so that it is a part of one below it, and the gap between them [m] (ours)."""
+FLOATS = 0.04  # Height above all planes from which a thing floats, so that it is a part of one below it [m] (ours)
+GAP = 0.06  # Largest gap between these [m] (ours)
+UNDER = 0.01  # Distance aside up to which one is below the other [m] (ours)
 BACK = 0.03  # Points so far behind a plane are the edges of its board [m] (ours)
 LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
 CORE = 5  # Neighbours of a cube that joins others (ours): single points between two things, as cameras make, join none
@@ -39,8 +42,9 @@ LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours
 FRAGMENT = 0.03  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
 PART = 0.15  # Share of a thing that both sides of a seam have, at least [1] (ours)
-NOTHING, STRUCTURE, OTHER = -1, -2, -3
-"""Labels of scattered points, of planes, and of what is too large to be meant; things have numbers from 0."""
+NOTHING = -1  # Label of scattered points; things have numbers from 0
+STRUCTURE = -2  # Label of tables, boards and walls
+OTHER = -3  # Label of what is too large or too far away to be meant
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,8 @@ class _View:
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> _View:
-        kept, cell_of = np.ones(len(points), bool), np.full(len(points), -1)
+        kept: Bool[np.ndarray, " n"] = np.ones(len(points), bool)
+        cell_of = np.full(len(points), -1)
         if camera is not None and len(points):
             away = np.linalg.norm(points - camera, axis=1)
             kept = away < max(REACH, 2 * float(np.quantile(away, 0.02)))
@@ -150,7 +155,7 @@ class _Plane:
         if grown:
             patch = ndimage.binary_dilation(patch, iterations=grown)
         at = np.floor((points @ self.axes.T - self.corner) / PATCH).astype(int) + grown + 3
-        inside = ((at >= 0) & (at < patch.shape)).all(1)
+        inside: Bool[np.ndarray, " n"] = np.asarray(((at >= 0) & (at < patch.shape)).all(1))
         inside[inside] = patch[tuple(at[inside].T)]
         return inside
 
@@ -298,7 +303,7 @@ def _join_floating(
         below = others[_over(cells[others], levels[0]) < float(np.quantile(_over(own, levels[0]), 0.02))]
         if not len(below):
             continue
-        beside = KDTree(own @ flat.T).query(cells[below] @ flat.T)[0] < 0.5 * GAP / 3  # under it, up to a centimetre
+        beside = KDTree(own @ flat.T).query(cells[below] @ flat.T)[0] < UNDER
         gap = KDTree(own).query(cells[below])[0]
         near = below[beside & (gap < GAP)]
         if len(near):
@@ -336,5 +341,5 @@ def _has_seam(
     inward = ((normals[i] - normals[j]) * between).sum(1)
     seam = np.bincount(mine[inward > CONCAVE].ravel(), minlength=len(own)) > 0
     smooth = mine[~seam[mine].any(1)]
-    sizes = np.sort(np.bincount(_joined(smooth, len(own))))[::-1]
+    sizes = sorted(np.bincount(_joined(smooth, len(own))).tolist(), reverse=True)
     return len(sizes) > 1 and sizes[1] >= PART * len(own)
