@@ -31,7 +31,8 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
 from dro_grasp.objects.perception.scan import load_scan, scanned_object
-from dro_grasp.objects.scenery import Scene, load_scene
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import FoundObject, Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
@@ -85,11 +86,17 @@ class Answerer:
         """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work."""
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
-        constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))
+        found = None if call.choose is None else self.chosen(call)
+        obstacles = self.scene(call.obstacles, call.camera) if found is None else found.obstacles
+        constraints = settings_in(call, Constraints, obstacles=obstacles)
         if request.num * request.candidates > MAX_CANDIDATES:
             raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
                               f"most {MAX_CANDIDATES} candidates at once, `dro-grasp generate` more")
-        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        hand = self.hand(call.hand)
+        if found is None:
+            key, obj = self.object(call.object, call.camera)
+        else:
+            key, obj = found.obj.sha256, found.obj
         if call.protocol is not None and obj.is_cloud:
             raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
         obj = obj if call.mass is None else with_mass(obj, call.mass)
@@ -156,6 +163,29 @@ class Answerer:
                 return scene if camera is None else scene.moved(sent_pose(camera).numpy())
 
         return self.library.loaded("scene", content_key(sent, camera), load)
+
+    def chosen(self, call: Any) -> FoundObject:
+        """The one thing of a scene that was sent.
+
+        Raises:
+            ObjectError: It is not there, or it is not clear which is meant.
+            OptionError: Obstacles are given as well, or the scene is named.
+        """
+        sent, camera, choice = call.object, call.camera, call.choose
+        if call.obstacles is not None:
+            raise OptionError("choose and obstacles are given, and all else in the scene counts as obstacles; leave out obstacles")
+        if sent.name is not None:
+            raise OptionError(f"choose is given, and the object is named '{sent.name}'; send the scene")
+
+        def load() -> Scene:
+            seen_by = None if camera is None else SceneCamera(
+                sent_pose(camera).numpy(), None if camera.intrinsics is None else np.array(camera.intrinsics), camera.frame,
+                camera.depth_unit)
+            with unpacked(sent, {}) as source:
+                return load_scene(source, scale=sent.scale, camera=seen_by)
+
+        scene = self.library.loaded("scene", (content_key(sent, camera), "seen"), load)
+        return scene.object_at(choice.at, pixel=choice.pixel, nearest=choice.nearest)
 
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
         with unpacked(sent, self.library.own["object"]) as source:
