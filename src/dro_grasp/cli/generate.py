@@ -172,7 +172,7 @@ class Generate:
 
         if (self.object is None) == (self.scene is None):
             raise OptionError("give --object NAME|PATH, or --scene CLOUD|DEPTH with the thing that is meant "
-                              f"({', '.join(CHOICES)}); {'neither' if self.object is None else 'both'} is given")
+                              f"({', '.join(CHOICES)}); {'neither is' if self.object is None else 'both are'} given")
         given = [option for option, value in zip(CHOICES, (self.at, self.pixel, self.mask, self.nearest or None), strict=True)
                  if value is not None]
         if self.scene is None and (given or self.scene_picture is not None):

@@ -206,7 +206,8 @@ def test_the_picture_shows_object_table_and_obstacles(tmp_path: Path) -> None:
     made = make_scene("table", 3, 9, 1, width=320)
     scene = made.load()
     draw_scene(scene, scene.object_at(tuple(made.middles[0])), tmp_path / "scene.png")
-    picture = np.asarray(Image.open(tmp_path / "scene.png")).astype(int)[:500, :640]
+    with Image.open(tmp_path / "scene.png") as image:
+        picture = np.asarray(image).astype(int)[:500, :640]
     red, _, blue = np.moveaxis(picture, 2, 0)
     assert (red > blue + 60).sum() > 300  # orange
     assert (blue > red + 60).sum() > 300  # blue

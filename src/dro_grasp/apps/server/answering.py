@@ -173,7 +173,8 @@ class Answerer:
         """
         sent, camera, choice = call.object, call.camera, call.choose
         if call.obstacles is not None:
-            raise OptionError("choose and obstacles are given, and all else in the scene counts as obstacles; leave out obstacles")
+            raise OptionError("choose and obstacles are given, and all else in the scene counts as obstacles; leave out "
+                              "obstacles")
         if sent.name is not None:
             raise OptionError(f"choose is given, and the object is named '{sent.name}'; send the scene")
 
