@@ -21,7 +21,7 @@ from dro_grasp.objects.reading import numbers, read_cloud, returned
 
 IMAGES = {".png", ".tif", ".tiff"}  # Files of depth images, beside NPY
 WHOLE_UNIT = 0.001  # Unit of depths that are whole numbers [m]. Source: REP 118, ROS
-NARROWEST = 8  # Width from which an array (h, w) is an image, and no list of points (ours)
+NARROWEST = 32  # Width from which an array (h, w) is an image, and no list of points (ours)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
 CORE = 5  # Neighbours of a cube that joins others (ours): single points between two things, as cameras make, join none
 LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetres
 LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours)
-FRAGMENT = 0.03  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
+FRAGMENT = 0.015  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
 PART = 0.15  # Share of a thing that both sides of a seam have, at least [1] (ours)
 NOTHING = -1  # Label of scattered points; things have numbers from 0
@@ -320,8 +320,8 @@ def _take_fragments(cells: Float[np.ndarray, "r 3"], labels: Int[np.ndarray, " r
     things, scattered = np.flatnonzero(labels >= 0), np.flatnonzero(labels == NOTHING)
     if len(things) and len(scattered):
         away, nearest = KDTree(cells[things]).query(cells[scattered])
-        near = away < FRAGMENT / 2
-        labels[scattered[near]] = labels[things[nearest[near]]]
+        near = np.flatnonzero(away < FRAGMENT)
+        labels[scattered[near]] = labels[things[np.asarray(nearest)[near]]]
 
 
 def _has_seam(
