@@ -42,12 +42,14 @@ from .network.presets import NetworkConfig as NetworkConfig
 from .objects.catalogue import load_object as load_object, object_names as object_names
 from .objects.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from .objects.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-from .objects.scenery import Scene as Scene, load_scene as load_scene
+from .objects.perception.scene_files import SceneCamera as SceneCamera
+from .objects.scenery import FoundObject as FoundObject, Scene as Scene, load_scene as load_scene
 from .objects.shape import ObjectModel as ObjectModel
 from .optimize.fingers import ClosingConfig as ClosingConfig
 from .optimize.refinement import RefineConfig as RefineConfig
 from .optimize.squeeze import GripConfig as GripConfig
 from .optimize.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
+from .pictures.scene import draw_scene as draw_scene
 from .pictures.sheets import PictureStyle as PictureStyle, draw_grasps as draw_grasps
 from .predict.config import (
     GraspRequest as GraspRequest,

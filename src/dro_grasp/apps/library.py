@@ -83,6 +83,24 @@ class Library:
         """The scene of a name."""
         return self._of_name("scene", name, load_scene)
 
+    def add_things(self, name: str) -> dict[str, str]:
+        """Name each thing of a cloud that is a scene, as an object, and all else, as a scene: the two names of each.
+
+        There are none where the scene is a mesh, or shows one thing or none.
+        """
+        scene = self.scene(name)
+        if scene.sight is None or scene.segments.count < 2:
+            return {}
+        names: dict[str, str] = {}
+        for k in range(scene.segments.count):
+            points = scene.sight.world()[scene.segments.labels == k]
+            found = scene.object_at(points[len(points) // 2], name=f"thing {k + 1} of {name}")
+            names[found.obj.name] = rest = f"all but {found.obj.name}"
+            self.add("object", found.obj.name, found.obj)
+            if found.obstacles is not None:
+                self.add("scene", rest, found.obstacles)
+        return names
+
     def _of_name(self, kind: Kind, name: str, load: Callable[[Any], Any]) -> Any:
         if name not in self.names(kind):  # a name from elsewhere could be the path of any file
             raise OptionError(f"no {kind} is called '{name}' here; pick one of the list")

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.scenery import FoundObject
     from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.predict.config import GraspRequest
     from dro_grasp.predict.constraints import Constraints
     from dro_grasp.predict.predictor import GraspPredictor, Prediction
     from dro_grasp.predict.problem import GraspProblem
 
+CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
 TOGETHER = 64  # Objects of a folder that a GPU predicts together (ours): their distances fill some gigabytes
 
 
@@ -37,7 +39,20 @@ class Generate:
     """
 
     hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.
-    object: str  # An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them.
+    object: Annotated[str | None, optional("NAME|PATH", "none, with --scene")] = None
+    """An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them."""
+    scene: Annotated[Path | None, optional("CLOUD|DEPTH", "an object alone")] = None
+    """Instead of --object: what a camera saw, a cloud or a depth image (PNG, TIFF, NPY). One thing in it is the object, the
+    plane on which it stands its table, all else obstacles."""
+    at: Annotated[tuple[float, float, float] | None, optional("X Y Z", "the only thing")] = None
+    """Which thing of the scene: the one at this place [m], in the frame of the grasps."""
+    pixel: Annotated[tuple[float, float] | None, optional("U V", "the only thing")] = None
+    """Which thing of the scene: the one that this pixel shows, by column and row."""
+    mask: Annotated[Path | None, optional("PNG", "the only thing")] = None
+    """Which thing of the scene: the pixels that are not black in this image."""
+    nearest: Flag = False  # Which thing of the scene: the one nearest to the camera.
+    scene_picture: Annotated[Path | None, optional("PNG", "no picture")] = None
+    """Picture of what was taken for the object, for tables and walls, and for obstacles, before anything is grasped."""
     num: int = 16  # How many grasps of each object.
     candidates: int = 4  # Most candidates for each grasp; the best by score are kept. 1 is quickest.
     seed: int = 0  # The same seed gives the same grasps.
@@ -53,7 +68,7 @@ class Generate:
     clear of it: open and 10 cm back, on the straight way from there in pregrasp, in grasp and in squeeze."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}. The object is then a cloud in the camera's frame, which is cleaned.
-    Grasps, --direction and --table are in the named frame."""
+    Grasps, --direction and --table are in the named frame. For depth images, with "intrinsics": 3x3."""
     source: str = "auto"
     """What proposes candidates. network: the weights. optimiser: geometry alone, for any hand. auto: the network, and the
     optimiser for grasps that the score does not trust. module:Class: a source of yours. PATH: a grasp file."""
@@ -87,13 +102,14 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it, or let a server do it."""
+        self.check_scene()
         if (address := server_of(self.server)) is not None:
             return generate_at(address, self)
         from dro_grasp.errors import DroGraspError
 
         with progress_bar("loading libraries, hand and weights", self.json):
             names, outputs, pictures, job = self._prepare()
-        several = names != [self.object]
+        several = names != [self._source]
         done, failed = [], []
         for part in self._parts(list(zip(names, outputs, pictures, strict=True))):
             for (name, output, picture), made in zip(part, self._predict(job, [name for name, *_ in part]), strict=True):
@@ -130,18 +146,68 @@ class Generate:
         constraints = self.constraints.constraints(self.table)
         if self.touch_table is not None:
             constraints = replace(constraints, touch_table=self.touch_table == "yes")
-        names = resolve_objects([self.object])
-        several = names != [self.object]
+        names = [self._source] if self.scene is not None else resolve_objects([self._source])
+        several = names != [self._source]
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
+        found = None
+        if self.scene is not None:
+            found = self._find()
+            constraints = replace(constraints, obstacles=found.obstacles)
         if self.obstacles is not None:
             scene = load_scene(self.obstacles, scale=self.scale)
             constraints = replace(constraints, obstacles=scene if camera is None else scene.moved(camera.T.double().numpy()))
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
-        return names, outputs, pictures, Job(hand, predictor, request, constraints, camera, seconds)
+        return names, outputs, pictures, Job(hand, predictor, request, constraints, camera, found, seconds)
+
+    @property
+    def _source(self) -> str:
+        """What grasps are made of: the object, or the scene in which it is."""
+        return str(self.scene) if self.object is None else self.object
+
+    def check_scene(self) -> None:
+        """Refuse options that contradict one another, by an OptionError."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.files import check_output
+
+        if (self.object is None) == (self.scene is None):
+            raise OptionError("give --object NAME|PATH, or --scene CLOUD|DEPTH with the thing that is meant "
+                              f"({', '.join(CHOICES)}); {'neither is' if self.object is None else 'both are'} given")
+        given = [option for option, value in zip(CHOICES, (self.at, self.pixel, self.mask, self.nearest or None), strict=True)
+                 if value is not None]
+        if self.scene is None and (given or self.scene_picture is not None):
+            raise OptionError(f"{' and '.join([*given, *['--scene-picture'] * (self.scene_picture is not None)])} concern a "
+                              "scene; give it by --scene instead of --object")
+        if len(given) > 1:
+            raise OptionError(f"{' and '.join(given)} each say which thing of the scene is meant; give one of them")
+        if self.scene is not None and self.obstacles is not None:
+            raise OptionError("--obstacles and --scene are given, and all else in the scene counts as obstacles; leave out "
+                              "--obstacles")
+        if self.scene_picture is not None:
+            check_output(self.scene_picture, ".png")
+
+    def _find(self) -> FoundObject:
+        """The one thing of the scene that is meant; the picture is drawn even where none is."""
+        from dro_grasp.errors import ObjectError
+        from dro_grasp.objects.scenery import load_scene
+        from dro_grasp.pictures.scene import draw_scene
+
+        assert self.scene is not None
+        scene = load_scene(self.scene, scale=self.scale, camera=self.camera)
+        try:
+            found = scene.object_at(self.at, pixel=self.pixel, mask=self.mask, nearest=self.nearest)
+        except ObjectError:
+            if self.scene_picture is not None:
+                draw_scene(scene, None, self.scene_picture)
+                say_aside(f"what the scene shows: {self.scene_picture}")
+            raise
+        if self.scene_picture is not None:
+            draw_scene(scene, found, self.scene_picture)
+            say_aside(f"what was taken for the object: {self.scene_picture}")
+        return found
 
     def _parts(self, jobs: list[Any]) -> list[list[Any]]:
         """Objects that are predicted together: one by one on the CPU."""
@@ -183,7 +249,7 @@ class Generate:
 
         begin = time.perf_counter()
         with progress_bar(f"reading {Path(name).name}", self.json):
-            obj = self._load(name, job.camera)
+            obj = self._load(name, job.camera) if job.found is None else self._weighed(job.found.obj)
         seconds = time.perf_counter() - begin
         if self.only_successful:
             require_trial(obj, self.protocol)
@@ -218,7 +284,8 @@ class Generate:
         if not len(kept):
             self.say_that_none_is_left(obj.name, output, picture)
         if output is not None:
-            with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
+            # Of a scene's file alone the object cannot be loaded again.
+            with_sources(kept, self.hand, name if job.found is None else "", self.scale, job.camera).save(output)
         if picture is not None and len(kept):
             from dro_grasp.pictures.sheets import draw_grasps
 
@@ -252,14 +319,18 @@ class Generate:
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
         from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.shape import with_mass
 
         if camera is None:
             return load_object(name, scale=self.scale, keep_table=self.keep_table, mass=self.mass)
         from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
 
-        scan = load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
-        return scan if self.mass is None else with_mass(scan, self.mass)
+        return self._weighed(load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table))
+
+    def _weighed(self, obj: ObjectModel) -> ObjectModel:
+        """The object with the mass that was stated, if any."""
+        from dro_grasp.objects.shape import with_mass
+
+        return obj if self.mass is None else with_mass(obj, self.mass)
 
     def _evaluate(self, problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
         from dro_grasp.apps.report import NO_TRIAL, protocol_for
@@ -309,6 +380,7 @@ class Job:
     request: GraspRequest
     constraints: Constraints
     camera: NamedMotion | None
+    found: FoundObject | None  # the object, out of a scene
     seconds: dict[str, float]  # Time to start, most of which goes to loading libraries, and to load hand and weights [s].
 
 

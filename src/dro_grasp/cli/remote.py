@@ -23,6 +23,7 @@ HERE = "none"  # Address that stands for no server
 TIMEOUT = 600.0  # Longest wait for a server [s] (ours); its own limit ends a request earlier
 OWN = ("weights", "device")  # Options that are the server's own
 SHOWN = ("picture", "view")  # Options that need the hand and the object here
+SCENE = ("scene", "at", "pixel", "mask", "nearest", "scene_picture")  # Options of scenes, which are taken apart here
 SOURCES = ("auto", "network", "optimiser")  # What proposes candidates at a server, which runs no code of others
 FAULT = 500  # Status of HTTP after a fault of dro-grasp
 
@@ -64,10 +65,11 @@ def generate_at(address: str, command: Generate) -> int:
 def require_possible(command: Generate) -> None:
     """Refuse what a server cannot do: OptionError."""
     defaults = {field.name: field.default for field in fields(command)}
-    given = [name for name in (*OWN, *SHOWN) if getattr(command, name) != defaults[name]]
+    given = [name for name in (*OWN, *SHOWN, *SCENE) if getattr(command, name) != defaults[name]]
     if given:
-        options = ", ".join(f"--{name}" for name in given)
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         why = ("weights and device are those that the server was started with" if given[0] in OWN
+               else "a scene is taken apart here; ask the server from Python, with choose=..." if given[0] in SCENE
                else "pictures and pages need hand and object here; draw the file with dro-grasp picture or view")
         raise OptionError(f"a grasp server cannot do {options}: {why}. Leave {options} out, or compute here (--server {HERE})")
     if command.source not in SOURCES:
@@ -76,6 +78,7 @@ def require_possible(command: Generate) -> None:
     if given_path(command.hand.partition("#")[0]).is_file():
         raise OptionError(f"--hand is the file {command.hand}; a grasp server knows hands by their names: start it with --hand "
                           f"{command.hand} and give the name, or compute here (--server {HERE})")
+    assert command.object is not None  # there is one where there is no scene
     if given_path(command.object).is_dir():
         raise OptionError(f"--object is the folder {command.object}; a grasp server takes one object at a time. Give a file, "
                           f"or compute here (--server {HERE})")
@@ -85,6 +88,7 @@ def call_of(command: Generate) -> dict[str, Any]:
     """What the server is asked."""
     from dro_grasp.apps.server.client import sent_object
 
+    assert command.object is not None
     file = given_path(command.object)
     sent = sent_object(file) if file.is_file() and file.suffix else {"name": command.object}
     same = ("hand", "num", "seed", "candidates", "refine", "temperature", "source", "least_confidence", "table", "mass",

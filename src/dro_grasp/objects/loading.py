@@ -17,7 +17,7 @@ from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
-from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.perception.things import AS_SCENE, one_thing, refuse_scene
 from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -116,7 +116,7 @@ def cloud_object(
     one = distinct_points(xyz)
     merged = () if len(one) == len(points) else (f"merged {len(points) - len(one)} duplicated points",)
     xyz, points, total = xyz[one], points[one], len(one)
-    table = None if keep_table else table_plane(xyz)
+    whole, table = xyz, None if keep_table else table_plane(xyz)
     if table is not None:
         kept = above_plane(xyz, table)
         xyz, points = xyz[kept], points[kept]
@@ -127,6 +127,8 @@ def cloud_object(
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
         check_view(xyz, origin, scale)
+    if not keep_table:
+        refuse_scene(whole, xyz, origin)
     if len(xyz) < MIN_CLOUD:
         raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
@@ -258,8 +260,7 @@ def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0
     largest = float(np.ptp(points, axis=0).max())
     if LARGEST < largest <= FARTHEST_VIEW:
         raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in "
-                          "metres, cut out the object that is meant; if its unit is not the metre, give "
-                          f"{_scale_hint(largest / scale, origin)}")
+                          f"metres, {AS_SCENE}; if its unit is not the metre, give {_scale_hint(largest / scale, origin)}")
     check_extent(points, origin, scale)
 
 

@@ -1,9 +1,10 @@
-"""What stands around an object, as a mesh or a cloud: read as it is, without the checks and repairs of objects."""
+"""Scenes: what a camera saw, of which one object is meant and all else is avoided; or a mesh or cloud of what is avoided."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +20,43 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
-from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry, returned
+from dro_grasp.objects.perception.choosing import Chosen, Sight, choose
+from dro_grasp.objects.perception.scene_files import (
+    SceneCamera,
+    as_camera,
+    is_depth,
+    read_depth,
+    sight_of_cloud,
+    sight_of_depth,
+)
+from dro_grasp.objects.perception.segmentation import Segments, segment
+from dro_grasp.objects.perception.taking import taken_object
+from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
 SPACING = 0.005  # Spacing of the grid of distances to a scene [m] (ours)
 LARGEST_GRID = 4_000_000  # Most points of such a grid; a larger one gets a wider spacing (ours)
 MARGIN = 0.03  # Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border
+THIN = 0.004  # Edge of the cubes of which each keeps one point of a cloud [m] (ours): cameras see far more
 TOUCH = 0.003  # Distance to a scene at which a point of an object's surface lies on it [m] (ours)
 
 
 @dataclass(frozen=True, eq=False)
+class FoundObject:
+    """The one object of a scene that is meant, and all else."""
+
+    obj: ObjectModel
+    """In the frame of the scene, with the plane on which it stands as its table, and notes on what is uncertain."""
+    obstacles: Scene | None
+    """All that was seen but the object and what it stands on; None for nothing."""
+    chosen: Chosen
+    """Which points were taken."""
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """A mesh, or a cloud of points, in the frame of an object."""
+    """A mesh, or a cloud of points, in the frame of an object or in the one that its camera file names."""
 
     name: str
     """Name, for messages."""
@@ -39,6 +64,8 @@ class Scene:
     """Vertices, or points of the cloud [m]."""
     faces: Int[np.ndarray, "m 3"] | None = None
     """Vertex indices of the mesh's triangles; None for a cloud."""
+    sight: Sight | None = None
+    """All points as they were seen; None for a mesh."""
 
     def __repr__(self) -> str:
         made = f"cloud of {len(self.points)} points" if self.faces is None else f"mesh of {len(self.faces)} faces"
@@ -46,7 +73,60 @@ class Scene:
 
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Scene:
         """The same in another frame; T takes its coordinates there [m]."""
-        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces)
+        sight = None if self.sight is None else self.sight.moved(T)
+        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces, sight)
+
+    @cached_property
+    def segments(self) -> Segments:
+        """Planes and things of the cloud, in the camera's frame if there is one.
+
+        Raises:
+            ObjectError: The scene is a mesh.
+        """
+        if self.sight is None:
+            raise ObjectError(f"the scene '{self.name}' is a mesh; give what a camera saw, a cloud or a depth image, to take "
+                              "one object out of it, or the object's own mesh")
+        return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
+
+    def chosen(
+        self, at: Sequence[float] | None = None, pixel: Sequence[float] | None = None, mask: Any = None,
+        nearest: bool = False,
+    ) -> Chosen:
+        """Which points are the object's; arguments as for `object_at`."""
+        segments = self.segments
+        assert self.sight is not None
+        return choose(self.name, self.sight, segments, at, pixel, mask, nearest)
+
+    @checked
+    def object_at(
+        self, at: Sequence[float] | None = None, *, pixel: Sequence[float] | None = None, mask: Any = None,
+        nearest: bool = False, name: str | None = None,
+    ) -> FoundObject:
+        """The object that is meant, completed, and all else as obstacles.
+
+        Examples:
+            >>> found = load_scene("depth.png", camera="camera.json").object_at(pixel=(310, 220))
+            >>> grasps = GraspPredictor().predict(hand, found.obj, obstacles=found.obstacles)
+
+        Args:
+            at: A place on it or near it, in the scene's frame: x, y, z [m].
+            pixel: A pixel that shows it: column and row, from the upper left.
+            mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG.
+            nearest: Take what is nearest to the camera.
+            name: What to call it; the scene's name by default.
+
+        With none of them, the scene has to show one thing alone.
+
+        Raises:
+            ObjectError: There is no thing there, or it is not clear which is meant.
+            OptionError: Two of them are given, or the scene lacks what one of them needs.
+        """
+        chosen = self.chosen(at, pixel, mask, nearest)
+        assert self.sight is not None
+        obj = taken_object(name or self.name, self.sight, self.segments, chosen)
+        others = self.sight.world()[chosen.others]
+        obstacles = Scene(f"what else '{self.name}' shows", others[one_per_cell(others, THIN)]) if len(others) else None
+        return FoundObject(obj, obstacles, chosen)
 
     def near(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> DistanceField | None:
         """Signed distances within a box [m]; None where nothing of the scene is near the box.
@@ -86,43 +166,72 @@ class Scene:
 
 
 @checked
-def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0) -> Scene:
-    """What a hand is to avoid, from the path of a mesh or cloud, a trimesh mesh or cloud, (vertices, faces), or points (n 3).
+def load_scene(
+    source: ObjectSource, name: str | None = None, scale: float = 1.0, *, camera: SceneCamera | Path | str | None = None
+) -> Scene:
+    """A scene, from the path of a mesh, cloud or depth image, a trimesh mesh or cloud, (vertices, faces), points or depths.
 
     Args:
-        source: The mesh or cloud, in the frame of the object that is to be grasped. Points with NaN and (0, 0, 0) are left out.
+        source: With a camera: what it saw, a cloud in its frame or a depth image along z, (h, w), as an array, PNG, TIFF or
+            NPY. Without: a mesh or cloud in the frame of the object. Points with NaN and (0, 0, 0) are left out.
         name: What to call it; the file's stem by default.
         scale: Multiplies all coordinates; 0.001 for millimetres.
+        camera: The camera, or the path of its JSON file.
 
     Raises:
         ObjectError: It cannot be read, is empty, or is not in metres, or `scale` is not positive.
+        OptionError: The camera's file is none, or has no intrinsics for a depth image.
     """
     check_scale(scale)
+    seen_by = None if camera is None else as_camera(camera)
     geometry: Any
     if isinstance(source, str | Path):
         path = given_path(source)
         if not path.is_file():
-            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD)")
-        (geometry, unit), label, origin = read_geometry(path), name or path.stem, str(path)
+            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD), or what "
+                              "a camera saw (also PNG, TIFF)")
+        label, origin = name or path.stem, str(path)
+        if is_depth(path):
+            return _seen(label, sight_of_depth(read_depth(path, seen_by), seen_by, scale, origin))
+        geometry, unit = read_geometry(path)
     else:
         (geometry, unit), label, origin = geometry_in_memory(source), name or "scene", "the given scene"
+        if isinstance(geometry, np.ndarray) and is_depth(geometry):
+            return _seen(label, sight_of_depth(np.asarray(source), seen_by, scale, origin))
     if isinstance(geometry, trimesh.Trimesh):
-        points, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int64)
-        if not len(faces) or faces.min() < 0 or faces.max() >= len(points) or not np.isfinite(points).all():
-            raise ObjectError(f"{origin} has {len(faces)} faces, or vertices that are absent or not finite; repair the mesh, "
-                              "or give a cloud")
-    else:
-        points, faces = coordinates(geometry, origin), None
-        points = points[returned(points)]
-    points = points * (scale * unit)
+        if seen_by is not None:
+            raise ObjectError(f"{origin} is a mesh, and no camera sees one; give its cloud or depth image, or leave out the "
+                              "camera")
+        return _of_mesh(label, geometry, origin, scale * unit)
+    return _seen(label, sight_of_cloud(coordinates(geometry, origin) * (scale * unit), seen_by, _shape(geometry)), origin)
+
+
+def _shape(cloud: Any) -> tuple[int, int] | None:
+    """Height and width of an organised cloud."""
+    return (cloud.shape[0], cloud.shape[1]) if cloud.ndim == 3 and cloud.shape[2] in (3, 6) else None
+
+
+def _of_mesh(label: str, mesh: trimesh.Trimesh, origin: str, scale: float) -> Scene:
+    points, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(points) or not np.isfinite(points).all():
+        raise ObjectError(f"{origin} has {len(faces)} faces, or vertices that are absent or not finite; repair the mesh, "
+                          "or give a cloud")
+    _check_coordinates(points * scale, origin)
+    return Scene(label, points * scale, faces)
+
+
+def _seen(label: str, sight: Sight, origin: str = "the depth image") -> Scene:
+    _check_coordinates(sight.points, origin)
+    points = sight.world()
+    return Scene(label, points[one_per_cell(points, THIN)], None, sight)
+
+
+def _check_coordinates(points: Float[np.ndarray, "n 3"], origin: str) -> None:
     if not len(points):
         raise ObjectError(f"{origin} holds no point; leave the scene out if nothing is to be avoided")
     if np.abs(points).max() > FARTHEST:
         raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m; divide millimetres by 1000 "
                           f"(scale), and leave out what is farther away than {FARTHEST:g} m")
-    if faces is None:
-        points = points[one_per_cell(points, 0.004)]  # [m] (ours): cameras see far more
-    return Scene(label, points, faces)
 
 
 def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Any:

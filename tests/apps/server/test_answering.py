@@ -13,12 +13,13 @@ import torch
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.predict import stages
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.problem import GraspProblem
 from tests.helpers.claw_urdf import claw, written
+from tests.helpers.made_scenes import make_scene
 from tests.helpers.weights import untrained_weights
 
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
@@ -185,3 +186,24 @@ def test_fields_of_before_are_taken_and_told(answerer: Answerer) -> None:
     with pytest.raises(ValueError, match="hold is called contact_region now, and both are given"):
         GraspCall(**asked, contact_region=[])
     assert "avoid is called obstacles now" in ask(answerer, "can", num=1, avoid={"points": [[9.0, 0, 0]]}).notes[-1]
+
+
+def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answerer, tmp_path: Path) -> None:
+    made = make_scene("table", 4, 15, 1, width=320)
+    np.save(tmp_path / "depth.npy", made.depth)
+    sent = {"file": sent_file("depth.npy", (tmp_path / "depth.npy").read_bytes())["file"]}
+    camera = {"frame": "world", "T_frame_camera": made.camera.T_frame_camera.tolist(),
+              "intrinsics": np.asarray(made.camera.intrinsics).tolist()}
+    middle = made.middles[1].tolist()
+    call = GraspCall(hand="gripper3", object=sent, camera=camera, choose={"at": middle}, **QUICK)
+    found = answerer.chosen(call)
+    assert np.linalg.norm((found.obj.cloud.min(0) + found.obj.cloud.max(0)) / 2 - made.middles[1]) < 0.02
+    assert found.obstacles is not None
+    for k in (0, 2, 3):  # the others are avoided
+        assert np.linalg.norm(found.obstacles.points - made.middles[k], axis=1).min() < 0.05
+    with pytest.raises(ObjectError, match="shows 4 things"):
+        ask(answerer, sent, camera=camera, choose={})
+    with pytest.raises(OptionError, match="leave out obstacles"):
+        ask(answerer, sent, camera=camera, choose={"nearest": True}, obstacles={"points": [[0, 0, 0]]})
+    answer = ask(answerer, sent, camera=camera, choose={"at": middle}, num=1, least_confidence=0)
+    assert answer.frame == "world"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 
+import numpy as np
 import pytest
 import trimesh
 import viser
@@ -79,3 +80,30 @@ def test_what_no_constraint_can_be_is_told(studio: Studio, field: str, text: str
     assert studio.status.content.startswith("**Error:**")
     assert message in studio.status.content
     control.value = before
+
+
+def test_the_things_of_a_scene_can_be_picked_and_all_else_is_avoided(studio: Studio) -> None:
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.004), np.arange(-0.3, 0.3, 0.004))
+    parts = [np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)]
+    for middle in ((0.2, 0.1), (-0.2, -0.1)):
+        box = trimesh.creation.box((0.06, 0.06, 0.1), trimesh.transformations.translation_matrix([*middle, 0.05]))
+        parts.append(np.asarray(trimesh.sample.sample_surface(box, 4000, seed=0)[0]))
+    np.save(file := io.BytesIO(), np.concatenate(parts))
+    before, panel = studio.object.value, studio.panel
+    panel.contact_region.value = panel.keep_out.value = panel.table.value = ""
+    upload = viser.UploadedFile(name="desk.npy", content=file.getvalue())
+    studio._take(upload, "scene", panel.obstacles, studio._draw_constraints)
+    assert studio.object.value == "thing 1 of desk.npy"
+    for k in (1, 2):
+        studio.object.value = f"thing {k} of desk.npy"
+        studio._pick_object()
+        obj, found = asked(studio)[0].obj, asked(studio)[0].constraints.obstacles
+        assert found is not None
+        own, other = sorted(((0.2, 0.1), (-0.2, -0.1)), key=lambda m: float(np.linalg.norm(obj.cloud[:, :2].mean(0) - m)))
+        assert np.linalg.norm(obj.cloud[:, :2].mean(0) - own) < 0.01
+        assert np.linalg.norm(found.points[:, :2] - other, axis=1).min() < 0.05
+        assert np.linalg.norm(found.points[:, :2] - own, axis=1).min() > 0.1
+        assert studio.client.scene.get_handle_by_name("/constraints/obstacles") is not None
+    studio.object.value = before
+    studio._pick_object()
+    assert panel.obstacles.value == NOTHING

@@ -70,7 +70,7 @@ def test_a_view_of_a_room_is_called_one() -> None:
         points = size * rng.uniform(-0.5, 0.5, (3000, 3))
         with pytest.raises(ObjectError, match="too large") as caught:
             load_object(points)
-        assert ("a camera's view in metres, cut out the object" in str(caught.value)) == told
+        assert ("a camera's view in metres, give it as a scene" in str(caught.value)) == told
 
 
 def test_groups_are_what_stands_apart_however_sparse_the_points_are() -> None:

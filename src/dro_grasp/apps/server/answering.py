@@ -42,7 +42,8 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
 from dro_grasp.objects.perception.scan import load_scan, scanned_object
-from dro_grasp.objects.scenery import Scene, load_scene
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import FoundObject, Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
@@ -149,8 +150,10 @@ class Answerer:
 
     def problem(self, call: Any) -> GraspProblem:
         """The pair of a call, with its constraints; the last few are kept."""
-        constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))
-        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        found = None if call.choose is None else self.chosen(call)
+        obstacles = self.scene(call.obstacles, call.camera) if found is None else found.obstacles
+        constraints, hand = settings_in(call, Constraints, obstacles=obstacles), self.hand(call.hand)
+        key, obj = self.object(call.object, call.camera) if found is None else (found.obj.sha256, found.obj)
         obj = obj if call.mass is None else with_mass(obj, call.mass)
         pair = hand.name, key, call.mass, constraints
         if (problem := self.problems.get(pair)) is None:
@@ -204,6 +207,30 @@ class Answerer:
                 return scene if camera is None else scene.moved(sent_pose(camera).numpy())
 
         return self.library.loaded("scene", content_key(sent, camera), load)
+
+    def chosen(self, call: Any) -> FoundObject:
+        """The one thing of a scene that was sent.
+
+        Raises:
+            ObjectError: It is not there, or it is not clear which is meant.
+            OptionError: Obstacles are given as well, or the scene is named.
+        """
+        sent, camera, choice = call.object, call.camera, call.choose
+        if call.obstacles is not None:
+            raise OptionError("choose and obstacles are given, and all else in the scene counts as obstacles; leave out "
+                              "obstacles")
+        if sent.name is not None:
+            raise OptionError(f"choose is given, and the object is named '{sent.name}'; send the scene")
+
+        def load() -> Scene:
+            seen_by = None if camera is None else SceneCamera(
+                sent_pose(camera).numpy(), None if camera.intrinsics is None else np.array(camera.intrinsics), camera.frame,
+                camera.depth_unit)
+            with unpacked(sent, {}) as source:
+                return load_scene(source, scale=sent.scale, camera=seen_by)
+
+        scene = self.library.loaded("scene", (content_key(sent, camera), "seen"), load)
+        return scene.object_at(choice.at, pixel=choice.pixel, nearest=choice.nearest)
 
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
         with unpacked(sent, self.library.own["object"]) as source:

@@ -91,6 +91,21 @@ class SentCamera(Message):
     """Name of the frame."""
     T_frame_camera: tuple[Row, Row, Row, Row]
     """The camera's pose in it [m]."""
+    intrinsics: tuple[Point, Point, Point] | None = None
+    """Pinhole matrix [pixels]; needed for depth images and for pixels."""
+    depth_unit: Number | None = Field(None, gt=0, le=1)
+    """Unit of a depth image [m]; by default a millimetre for whole numbers, else a metre."""
+
+
+class SentChoice(Message):
+    """Which thing of a scene is the object: one of the three, or none where there is one thing alone."""
+
+    at: Point | None = None
+    """A place on it, in the frame of the grasps [m]."""
+    pixel: tuple[Number, Number] | None = None
+    """A pixel that shows it: column and row."""
+    nearest: bool = False
+    """Take the one nearest to the camera."""
 
 
 class _Call(Message):
@@ -100,6 +115,8 @@ class _Call(Message):
     """What to grasp."""
     mass: Number | None = None
     """Mass of the object [kg], which the grasps shall carry; null for density times volume."""
+    choose: SentChoice | None = None
+    """The object is a scene, a cloud or a depth image (PNG, TIFF, NPY), of which one thing is meant; all else is avoided."""
     camera: SentCamera | None = None
     """Where the cloud was seen from; without one, it is taken to be in the frame of the grasps."""
     protocol: str | None = None

@@ -15,7 +15,7 @@ from functools import partial
 import viser
 
 from dro_grasp.apps.library import Kind, Library
-from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES, ConstraintPanel, given_number
+from dro_grasp.apps.viewer.constraint_panel import NOTHING, OBJECT_FILES, ConstraintPanel, given_number
 from dro_grasp.apps.viewer.grasp_page import GraspPage, ShownGrasps
 from dro_grasp.apps.viewer.scene_view import HOST, Client, Closed, ServedPage, escaped
 from dro_grasp.errors import DroGraspError
@@ -61,6 +61,7 @@ class Studio(GraspPage):
         self.predictor, self.library, self._first = predictor, Library(), (hand, obj)
         self._turn = turn or threading.Lock()
         self._batches: dict[str, GraspBatch] = {}  # grasps of a file, by the name of their object
+        self._rest: dict[str, str] = {}  # names of all else of a scene, by that of the thing in it
         self._given: dict[str, Hand] = {}  # the hand that came with a file's grasps, by the name of their object
         super().__init__(client)
         if preview:
@@ -120,6 +121,7 @@ class Studio(GraspPage):
 
     def _pick_object(self) -> None:
         """Show the grasps of the chosen object if a file has some of the chosen hand, and the pair alone otherwise."""
+        self._pick_rest()
         grasps = self._batches.get(self.object.value)
         hand = self.library.hand(self.hand.value)
         if grasps is None or (grasps.hand_sha256 != hand.sha256 and self._given.get(self.object.value) is not hand):
@@ -192,9 +194,32 @@ class Studio(GraspPage):
             self._guarded(lambda: self._pick_upload(label, choice, show), patience, later)
 
     def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
+        things = self.library.add_things(label) if choice is self.panel.obstacles else {}
+        if things:
+            self._offer_things(things)
+            return
         choice.value = label
         show()
         self._say(f"{escaped(label)} is picked. {self.status.content}")
+
+    def _offer_things(self, things: dict[str, str]) -> None:
+        """Let each thing of a scene be picked as the object, with all else around it, and pick the first."""
+        self._rest |= things
+        self.object.options = self.library.names("object")
+        self.panel.obstacles.options = (NOTHING, *self.library.names("scene"))
+        self.object.value = first = next(iter(things))
+        self._pick_object()
+        self._say(f"The scene shows {len(things)} things. {escaped(first)} is picked, and all else is avoided; pick another "
+                  "one from the list of objects.")
+
+    def _pick_rest(self) -> None:
+        """Avoid all else of the scene that the chosen object is a thing of."""
+        rest = self._rest.get(self.object.value)
+        if rest in self.panel.obstacles.options:
+            self.panel.obstacles.value = rest
+            self.panel.draw(self.panel.constraints(self.library.scene), self.library.obj(self.object.value))
+        elif self.panel.obstacles.value in self._rest.values():
+            self.panel.obstacles.value = NOTHING
 
     def _table_under(self) -> None:
         """Put the table under the chosen object."""

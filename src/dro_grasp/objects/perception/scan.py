@@ -27,7 +27,7 @@ from dro_grasp.objects.loading import (
     table_note,
 )
 from dro_grasp.objects.perception.completion import complete_cloud
-from dro_grasp.objects.perception.things import one_thing
+from dro_grasp.objects.perception.things import one_thing, refuse_scene
 from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -59,7 +59,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if image.ndim != 2:
         raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
-    _check_intrinsics(matrix, *image.shape)
+    check_intrinsics(matrix, *image.shape)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
@@ -70,14 +70,14 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    _check_depths(float(np.median(image[valid])))
+    check_depths(float(np.median(image[valid])))
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
     rays = np.linalg.solve(matrix, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
 
 
-def _check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int) -> None:
+def check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int) -> None:
     """Refuse a matrix that is no pinhole camera's, or that of an image of another size, by an ObjectError."""
     expected = (f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image of {width} x {height}, with the "
                 f"principal point (cx, cy) near ({width / 2:g}, {height / 2:g})")
@@ -110,7 +110,7 @@ def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int,
                           f"{expected}")
 
 
-def _check_depths(median: float) -> None:
+def check_depths(median: float) -> None:
     """Refuse depths whose median is too far for metres, by an ObjectError that names their likely unit."""
     least, most = DEPTHS
     if median <= most:
@@ -135,7 +135,7 @@ def load_scan(
 @checked
 def scanned_object(
     name: str, points: ArrayLike, T_frame_camera: ArrayLike | None = None, denoise: bool = True, complete: bool = True,
-    keep_table: bool = False,
+    keep_table: bool = False, up: ArrayLike | None = None,
 ) -> ObjectModel:
     """An object from the points of a camera at the origin; its grasps are in the given frame.
 
@@ -151,6 +151,7 @@ def scanned_object(
         complete: Add the unseen side; switch it off for a scan from all sides.
         keep_table: Keep every point. By default a table in the cloud is found and cut off, with a note, and hands stay above
             it.
+        up: The upward direction in the camera's frame, (3,), which completion prefers; by default the wanted frame's z axis.
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
@@ -164,8 +165,8 @@ def scanned_object(
         normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
     if complete:
-        up = None if T is None else T[2, :3]
-        kept, normals, added = complete_cloud(kept, normals, camera, up)
+        upward = numbers(up, "up").astype(np.float64) if up is not None else None if T is None else T[2, :3]
+        kept, normals, added = complete_cloud(kept, normals, camera, upward)
     if T is not None:
         R, t = T[:3, :3], T[:3, 3]
         kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
@@ -192,7 +193,7 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     told = () if there.all() else (dropped_note(int((~there).sum()), len(there)),)
     rows = rows[there]
     rows = rows[distinct_points(rows[:, :3])]
-    total, table = len(rows), None if keep_table else table_plane(rows[:, :3], camera)
+    whole, total, table = rows[:, :3], len(rows), None if keep_table else table_plane(rows[:, :3], camera)
     if table is not None:
         rows = rows[above_plane(rows[:, :3], table)]
     cut = total - len(rows)
@@ -206,6 +207,8 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     if len(rows) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(rows)} points after cleaning; give a denser cloud or a larger mask")
     check_view(rows[:, :3], name)
+    if not keep_table:
+        refuse_scene(whole, rows[:, :3], name)
     middle = rows[:, :3].mean(0)
     if float((rows[:, :3] @ middle).min()) <= LEAST_DEPTH * float(middle @ middle):
         raise ObjectError(f"{name} has points behind or beside the camera, which is at the cloud's origin; give the cloud in "

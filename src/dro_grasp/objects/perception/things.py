@@ -7,8 +7,12 @@ from jaxtyping import Float, Int
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_groups import separate_groups
+from dro_grasp.objects.perception.segmentation import CERTAIN_AREA, segment
 
 MOST_TOLD = 6  # Things that a message lists (ours)
+LIKELY = 0.5  # Extent up to which a cloud is taken for an object without asking [m] (ours)
+AS_SCENE = ("give it as a scene, of which one thing is meant (scene=FILE camera=JSON, and nearest=True, at=(X, Y, Z) or "
+            "pixel=(U, V); load_scene and object_at in Python)")  # What to do with a scene
 
 
 def one_thing(
@@ -28,13 +32,25 @@ def one_thing(
         said = f"{len(things)} things that stand apart ({told}{'; ...' if len(things) > MOST_TOLD else ''})"
         if on_table:
             raise ObjectError(
-                f"{origin} is a view of a table with {said}; cut out the one that is meant, for example the points within "
-                "10 cm of its middle, or keep all points as one object with keep_table=True")
-        return every, (f"it is {said}, and all of them count as one object; of a view of a scene, cut out the one that is "
-                       "meant",)
+                f"{origin} is a view of a table with {said}; {AS_SCENE}; or keep all points as one object with "
+                "keep_table=True")
+        return every, (f"it is {said}, and all of them count as one object; if it is a view, {AS_SCENE}",)
     if not on_table or not things or len(things[0]) == len(points):
         return every, ()
     return np.sort(things[0]), (f"{len(points) - len(things[0])} scattered points beside it were left out",)
+
+
+def refuse_scene(points: Float[np.ndarray, "n 3"], kept: Float[np.ndarray, "m 3"], origin: str) -> None:
+    """Refuse a cloud, of which some points are taken for the object [m], that shows a room: ObjectError."""
+    if not len(kept) or np.ptp(kept, axis=0).max() <= LIKELY:
+        return
+    shown = segment(points)
+    if not shown.count or max(shown.areas, default=0.0) < CERTAIN_AREA:
+        return
+    things = "1 thing" if shown.count == 1 else f"{shown.count} things"
+    raise ObjectError(f"{origin} is a scene, and no object: it is {np.ptp(points, axis=0).max():.2f} m long and shows a plane "
+                      f"of {max(shown.areas):.2f} m² and {things} beside it; {AS_SCENE}; or keep all points as one object with "
+                      "keep_table=True")
 
 
 def _cm(points: Float[np.ndarray, "n 3"]) -> str:

@@ -1,0 +1,266 @@
+"""Which thing of a scene is meant: by a place, a pixel, a mask, or as the nearest; and what is uncertain about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.objects.perception.segmentation import NOTHING, STRUCTURE, Segments
+from dro_grasp.objects.reading import numbers
+
+BESIDE = 0.05  # Longest way from a given place to the thing that is meant [m] (ours)
+ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
+BORDER = 3  # Pixels from the image's border that touch it (ours)
+EDGE = 0.01  # The same of a cloud, as a share of its width [1] (ours)
+TOLD = 8  # Things that a message lists (ours)
+ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
+PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
+LEAST_MASK = 60  # Fewest points in a mask (ours)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """The points that a camera saw, or the points of a cloud from all sides."""
+
+    points: Float[np.ndarray, "n 3"]  # in the camera's frame, or in the scene's without a camera [m]
+    T: Float[np.ndarray, "4 4"]  # pose of that frame in the scene's [m]
+    from_camera: bool  # whether a camera at the origin saw them
+    pixels: Int[np.ndarray, " n"]  # index into the flat image or the given rows
+    shape: tuple[int, int] | None = None  # height and width of the image, if it was one [pixels]
+    intrinsics: Float[np.ndarray, "3 3"] | None = None  # [pixels]
+
+    def world(self) -> Float[np.ndarray, "n 3"]:
+        """The points in the scene's frame [m]."""
+        return trimesh.transform_points(self.points, self.T)
+
+    def moved(self, T: Float[np.ndarray, "4 4"]) -> Sight:
+        """The same in another frame; T takes the scene's coordinates there [m]."""
+        return replace(self, T=T @ self.T)
+
+    def image(self) -> Float[np.ndarray, "n 2"] | None:
+        """Column and row of each point; None where neither an image nor intrinsics tell them."""
+        if self.shape is not None:
+            return np.stack(np.divmod(self.pixels, self.shape[1])[::-1], 1).astype(float)
+        if self.intrinsics is None or not self.from_camera:
+            return None
+        seen = self.points @ self.intrinsics.T
+        return seen[:, :2] / np.maximum(seen[:, 2:], 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The points of one object of a scene, and the others."""
+
+    own: Int[np.ndarray, " k"]  # indices of the points of the sight
+    others: Int[np.ndarray, " m"]  # those to avoid: all others but scattered ones and the plane on which it stands
+    below: int | None  # number of the plane on which it stands
+    pixels: Int[np.ndarray, " k"]  # its pixels in the flat image, or its rows of the given cloud
+    notes: tuple[str, ...]  # what is uncertain
+
+
+def choose(
+    name: str, sight: Sight, segments: Segments, at: Sequence[float] | None, pixel: Sequence[float] | None, mask: Any,
+    nearest: bool,
+) -> Chosen:
+    """The points of the thing that is meant; see `Scene.object_at`."""
+    given = [way for way, said in (("at", at is not None), ("pixel", pixel is not None), ("mask", mask is not None),
+                                   ("nearest", nearest)) if said]
+    if len(given) > 1:
+        raise OptionError(f"{' and '.join(given)} each say which object is meant; give one of them")
+    if mask is not None:
+        own = _masked(name, sight, segments, mask)
+        return _chosen(sight, segments, own, ())
+    if not segments.count:
+        raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
+                          "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
+    if at is not None:
+        number = _at(name, sight, segments, at)
+    elif pixel is not None:
+        number = _at_pixel(name, sight, segments, pixel)
+    elif nearest:
+        number = _nearest(name, sight, segments)
+    elif segments.count == 1:
+        number = 0
+    else:
+        raise ObjectError(f"'{name}' shows {segments.count} things ({listed(sight, segments)}); say which is meant: by a place "
+                          "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or as the nearest to the "
+                          "camera (nearest=True)")
+    own = np.flatnonzero(segments.labels == number)
+    seam = ("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If so, give "
+            "the pixels of the one that is meant (mask=PNG)",) if segments.seams[number] else ()
+    return _chosen(sight, segments, own, (*seam, *_beside(sight, segments, own)))
+
+
+def _beside(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
+    """A note where another thing is so near that it may be a part of this one, which hides the part between."""
+    others = segments.labels >= 0
+    others[own] = False
+    if not others.any():
+        return ()
+    own = own[:: max(1, len(own) // 4000)]
+    other = np.flatnonzero(others)
+    other = other[:: max(1, len(other) // 20000)]
+    away = float(KDTree(sight.points[other]).query(sight.points[own])[0].min())
+    return (f"another thing, {1000 * away:.0f} mm beside it, counts as an obstacle. If it is a part of this one, give the "
+            "pixels of both (mask=PNG)",) if away < PART_OF else ()
+
+
+def listed(sight: Sight, segments: Segments) -> str:
+    """The things of a scene in words, with their sizes and places [the scene's frame]."""
+    world = sight.world()
+    told = []
+    for number in range(min(segments.count, TOLD)):
+        points = world[segments.labels == number]
+        size = " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0))
+        told.append(f"{size} cm at {place_of(points)}")
+    return "; ".join(told) + ("; ..." if segments.count > TOLD else "")
+
+
+def place_of(points: Float[np.ndarray, "n 3"]) -> str:
+    """The middle of points in words [m]."""
+    return " ".join(f"{value + 0.0:.2f}" for value in (points.min(0) + points.max(0)) / 2)
+
+
+def _planes(segments: Segments) -> str:
+    areas = [f"{area:.2g} m²" for area in segments.areas]
+    return f"{len(areas)} {'plane' if len(areas) == 1 else 'planes'} ({', '.join(areas)})" if areas else "no plane"
+
+
+def _at(name: str, sight: Sight, segments: Segments, at: Sequence[float]) -> int:
+    place = numbers(at, "at").astype(np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise OptionError(f"at is {list(at)}; give x, y and z in metres")
+    world, labels = sight.world(), segments.labels
+    things = np.flatnonzero(labels >= 0)
+    away = np.linalg.norm(world[things] - place, axis=1)
+    closest = int(away.argmin())
+    # A place may lie within a thing, of which a camera sees only the near side.
+    within = _inside(world, labels, place, segments.count)
+    if away[closest] > BESIDE and within is None:
+        raise ObjectError(f"'{name}' shows no thing within {100 * BESIDE:.0f} cm of {place_of(place[None])}: the nearest is "
+                          f"{100 * away[closest]:.0f} cm away. It shows {listed(sight, segments)}")
+    return int(labels[things[closest]]) if within is None else within
+
+
+def _inside(
+    world: Float[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], place: Float[np.ndarray, "3"], count: int
+) -> int | None:
+    """The thing in whose box a place lies; the one with the smallest box of several."""
+    found = []
+    for number in range(count):
+        points = world[labels == number]
+        low, high = points.min(0), points.max(0)
+        if ((place >= low) & (place <= high)).all():
+            found.append((float(np.prod(high - low)), number))
+    return min(found)[1] if found else None
+
+
+def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Sequence[float]) -> int:
+    image, wanted = sight.image(), numbers(pixel, "pixel").astype(np.float64)
+    if image is None:
+        raise OptionError(f"a pixel is given, and '{name}' is a cloud without an image; state \"intrinsics\" in the camera's "
+                          "file, or give a place (at=(X, Y, Z))")
+    if wanted.shape != (2,) or not np.isfinite(wanted).all():
+        raise OptionError(f"pixel is {list(pixel)}; give its column and row")
+    if sight.shape is not None and not ((wanted >= 0) & (wanted < sight.shape[::-1])).all():
+        raise OptionError(f"pixel is {wanted[0]:g} {wanted[1]:g}, beside the image of {sight.shape[1]} x {sight.shape[0]}; "
+                          "give its column and row, from the upper left")
+    away = np.linalg.norm(image - wanted, axis=1)
+    closest = int(away.argmin())
+    if away[closest] > ASIDE:
+        raise ObjectError(f"no pixel within {ASIDE} of {wanted[0]:g} {wanted[1]:g} has a depth; '{name}' shows "
+                          f"{listed(sight, segments)}")
+    number = int(segments.labels[closest])
+    if number < 0:
+        what = {STRUCTURE: "a table, board or wall", NOTHING: "scattered points"}.get(number, "something too large or far away")
+        raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}; '{name}' shows {listed(sight, segments)}")
+    return number
+
+
+def _nearest(name: str, sight: Sight, segments: Segments) -> int:
+    if not sight.from_camera:
+        raise OptionError(f"nearest asks for the camera's place, and '{name}' has none; give the camera, or a place "
+                          "(at=(X, Y, Z))")
+    away = np.linalg.norm(sight.points, axis=1)
+    return int(np.argmin([np.quantile(away[segments.labels == k], 0.05) for k in range(segments.count)]))
+
+
+def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
+    from dro_grasp.objects.perception.scene_files import read_mask
+
+    if sight.shape is None:
+        raise OptionError(f"a mask is given, and '{name}' is a cloud without an image; give the depth image, an organised "
+                          "cloud (h, w, 3), or a place (at=(X, Y, Z))")
+    wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else numbers(mask, "the mask", "biuf") != 0
+    if wanted.shape != sight.shape:
+        raise ObjectError(f"the mask has shape {wanted.shape}, the image {sight.shape}; give one of the same size")
+    own = np.flatnonzero(wanted.ravel()[sight.pixels] & (segments.labels != STRUCTURE))
+    if len(own) < LEAST_MASK:
+        raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
+                          f"needed; give one that is true on the object. '{name}' shows {listed(sight, segments)}")
+    # Masks reach over an object's outline: of what is behind it, the part with fewer points is left out.
+    labels = segments.labels[own]
+    if (labels >= 0).any():
+        most = np.bincount(labels[labels >= 0]).argmax()
+        near = KDTree(sight.points[own[labels == most]]).query(sight.points[own])[0] < BESIDE
+        own = own[near]
+    return own
+
+
+def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...]) -> Chosen:
+    labels, taken = segments.labels, np.zeros(len(sight.points), bool)
+    taken[own] = True
+    below = _below(sight, segments, own)
+    avoided = (labels != NOTHING) & ~taken
+    if below is not None:
+        plane = segments.planes[below]
+        # Hands stay above the table by another way.
+        avoided &= (labels >= 0) | (np.abs(sight.points @ plane[:3] - plane[3]) > ON_TABLE)
+    return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
+
+
+def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> int | None:
+    """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one."""
+    if not segments.planes:
+        return None
+    points = sight.points[own]
+    normals = np.array([plane[:3] for plane in segments.planes])
+    up = normals[0]
+    if sight.from_camera and (level := np.abs(sight.T[2, :3] @ normals.T) > 0.9).any():
+        up = normals[level.argmax()]
+    # The lowest points, less those that noise puts lower (ours).
+    lows = [float(np.quantile(points @ plane[:3] - plane[3], 0.02)) for plane in segments.planes]
+    fits = [(low, i) for i, low in enumerate(lows) if normals[i] @ up > 0.9 and low > -0.02]
+    return min(fits)[1] if fits else None
+
+
+def _cut_off(sight: Sight, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
+    """A note where a thing reaches the border of the image, or of the cloud."""
+    image = sight.image() if sight.shape is not None else None
+    if image is not None and sight.shape is not None:
+        low, high = image[own].min(0), image[own].max(0)
+        size = np.array(sight.shape[::-1]) - 1
+        cut, what = bool((low < BORDER).any() or (high > size - BORDER).any()), "the image's border"
+    else:
+        flat = sight.points[:, :2] / np.maximum(sight.points[:, 2:], 1e-9) if sight.from_camera else sight.points[:, :2]
+        margin = EDGE * np.ptp(flat, axis=0)
+        cut = bool((flat[own].min(0) < flat.min(0) + margin).any() or (flat[own].max(0) > flat.max(0) - margin).any())
+        what = "the cloud's edge"
+    return (f"it reaches {what} and may be cut off there: grasps know nothing of the rest. Turn the camera so that all of it "
+            "is seen",) if cut else ()
+
+
+def shown(segments: Segments, chosen: Chosen | None) -> Bool[np.ndarray, " n"]:
+    """Which points are a table's, a board's or a wall's, and not the object's."""
+    mine = segments.labels == STRUCTURE
+    if chosen is not None:
+        mine[chosen.own] = False
+    return mine

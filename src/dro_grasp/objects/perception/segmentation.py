@@ -1,0 +1,345 @@
+"""A view of a scene taken apart: large planes (tables, boards, walls), the things that stand apart, and the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from dro_grasp.geometry.table_plane import largest_plane
+
+CELL = 0.004  # Edge of the cubes whose points are averaged [m] (ours): noise of single pixels goes, a finger's width stays
+MOST_CELLS = 45_000  # Filled cubes above which they grow (ours): what two cores take apart in 2 s
+REACH = 1.5  # Points nearer to the camera than this count [m], and those up to twice the distance of the nearest (ours)
+NEIGHBOURS = 24  # Neighbours that estimate a normal (ours): about 12 mm around
+NEAR = 0.008  # Points at most this far from a plane are counted for it [m] (ours)
+LEAST_THICK = 0.006  # Least half thickness of a plane [m] (ours): three standard deviations of 2 mm
+MOST_THICK = 0.016  # Largest half thickness of a plane [m] (ours); between, three standard deviations of what was seen
+TILTED = 0.7  # Least cosine between a plane's normal and those of its points [1] (ours)
+MOST_PLANES = 12  # Planes that are tried (ours): a shelf has eight
+PATCH = 0.02  # Edge of the squares in which a plane's area is counted [m] (ours)
+LEAST_AREA = 0.01  # Area from which a plane may be a wall [m^2] (ours)
+FIRST_AREA = 0.04  # Area from which the largest plane is what things stand on [m^2] (ours)
+CERTAIN_AREA = 0.1  # Area from which a plane is no side of a thing that a hand grasps [m^2] (ours)
+SPANS = 0.5  # Share of the largest plane's length that a smaller one beside it spans if it is a wall [1] (ours)
+LEAST_WALL = 0.25  # Shortest diagonal of a wall [m] (ours)
+LEAST_BOARD = 0.4  # Shortest diagonal of a board along the largest plane [m] (ours)
+LEAST_BOARD_AREA = 0.03  # Least area of a board along the largest plane [m^2] (ours)
+LONGEST_FACE = 0.35  # Longest thing that is all one plane: what is longer is a wall seen from outside [m] (ours)
+FLOATS = 0.04  # Height above all planes from which a thing floats, so that it is a part of one below it [m] (ours)
+GAP = 0.06  # Largest gap between these [m] (ours)
+UNDER = 0.01  # Distance aside up to which one is below the other [m] (ours)
+BACK = 0.03  # Points so far behind a plane are the edges of its board [m] (ours)
+LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
+CORE = 5  # Neighbours of a cube that joins others (ours): single points between two things, as cameras make, join none
+LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetres
+LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours)
+FRAGMENT = 0.015  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
+CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
+PART = 0.15  # Share of a thing that both sides of a seam have, at least [1] (ours)
+NOTHING = -1  # Label of scattered points; things have numbers from 0
+STRUCTURE = -2  # Label of tables, boards and walls
+OTHER = -3  # Label of what is too large or too far away to be meant
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """What a view shows."""
+
+    labels: Int[np.ndarray, " n"]
+    """Of each point: the number of its thing, the one with most points first, or NOTHING, STRUCTURE or OTHER."""
+    planes: tuple[Float[np.ndarray, "4"], ...]
+    """Planes: unit normals to the side from which they were seen, and heights along them [m]."""
+    areas: tuple[float, ...]
+    """Their visible areas [m^2]."""
+    seams: tuple[bool, ...]
+    """For each thing, whether a seam parts it, as two things have that touch."""
+
+    @property
+    def count(self) -> int:
+        """How many things there are."""
+        return len(self.seams)
+
+
+def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None) -> Segments:
+    """Take a cloud apart, which the camera sees from its place [m]; without one, it was seen from all sides.
+
+    Large planes come first, by sampled fits. What is left is joined by distance between points that have enough neighbours,
+    as in DBSCAN. Source: Fischler and Bolles 1981; Ester et al. 1996. Seams are found by the normals on both their sides, as
+    by Stein et al. 2014.
+    """
+    view = _View.of(points, camera)
+    planes = _planes(view)
+    owned = np.full(len(view.cells), NOTHING)
+    for plane in planes:
+        owned[plane.owns(view)] = STRUCTURE
+    rest = np.flatnonzero(owned == NOTHING)
+    owned[rest], seams = _things(view, rest, [plane.plane for plane in planes])
+    labels = np.where(view.cell_of >= 0, owned[view.cell_of], OTHER)
+    return Segments(labels, tuple(p.plane for p in planes), tuple(p.area for p in planes), seams)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The cubes of a cloud."""
+
+    cells: Float[np.ndarray, "k 3"]  # mean of the points of each [m]
+    normals: Float[np.ndarray, "k 3"]  # unit normals, to the camera or to no side
+    edge: float  # of the cubes [m]
+    camera: Float[np.ndarray, "3"] | None
+    cell_of: Int[np.ndarray, " n"]  # cube of each point; -1 for points too far away
+
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> _View:
+        kept: Bool[np.ndarray, " n"] = np.ones(len(points), bool)
+        cell_of = np.full(len(points), -1)
+        if camera is not None and len(points):
+            away = np.linalg.norm(points - camera, axis=1)
+            kept = away < max(REACH, 2 * float(np.quantile(away, 0.02)))
+        cells, own, edge = _averaged(points[kept])
+        cell_of[kept] = own
+        normals = _normals(cells)
+        if camera is not None:
+            normals = normals * np.where(((camera - cells) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
+        return cls(cells, normals, edge, camera, cell_of)
+
+
+def _averaged(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " n"], float]:
+    """Means of the points in each filled cube [m], the cube of each point, and the cubes' edge [m]."""
+    edge, low = CELL, points.min(0)
+    while True:
+        index = np.floor((points - low) / edge).astype(np.int64)
+        sides = index.max(0) + 1
+        _, own = np.unique((index[:, 0] * sides[1] + index[:, 1]) * sides[2] + index[:, 2], return_inverse=True)
+        own = own.reshape(-1)
+        count = int(own.max()) + 1
+        if count <= MOST_CELLS:
+            break
+        edge *= max(1.1, (count / MOST_CELLS) ** 0.5)
+    number = np.bincount(own, minlength=count)
+    return np.stack([np.bincount(own, points[:, k], count) / number for k in range(3)], 1), own, edge
+
+
+def _normals(cells: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    if len(cells) < 3:
+        return np.tile([0.0, 0.0, 1.0], (len(cells), 1))
+    near = KDTree(cells).query(cells, k=min(NEIGHBOURS, len(cells)))[1]
+    local = cells[near] - cells[near].mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """A plane with the patch of it that was seen."""
+
+    plane: Float[np.ndarray, "4"]  # unit normal to the side that was seen, and height along it [m]
+    thick: float  # [m]
+    axes: Float[np.ndarray, "2 3"]  # along the plane
+    corner: Float[np.ndarray, "2"]  # of the patch [m]
+    patch: Bool[np.ndarray, "u v"]  # squares of PATCH that are its own
+    area: float  # [m^2]
+    own: Int[np.ndarray, " _"]  # cubes that are on it
+
+    def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        return points @ self.plane[:3] - self.plane[3]
+
+    def beside(self, points: Float[np.ndarray, "n 3"], grown: int) -> Bool[np.ndarray, " n"]:
+        """Points over or under the patch, grown by some squares."""
+        patch = np.pad(self.patch, grown + 3)
+        patch = ndimage.binary_closing(patch, iterations=3)
+        if grown:
+            patch = ndimage.binary_dilation(patch, iterations=grown)
+        at = np.floor((points @ self.axes.T - self.corner) / PATCH).astype(int) + grown + 3
+        inside: Bool[np.ndarray, " n"] = np.asarray(((at >= 0) & (at < patch.shape)).all(1))
+        inside[inside] = patch[tuple(at[inside].T)]
+        return inside
+
+    def owns(self, view: _View) -> Bool[np.ndarray, " k"]:
+        """Which cubes are the plane's, or those of the board behind it."""
+        height = self.height(view.cells)
+        on = np.abs(height) <= self.thick
+        # The foot of a thing that stands on it has other normals than the plane.
+        on &= (np.abs(view.normals @ self.plane[:3]) > TILTED / 2) | (height < self.thick / 2)
+        back = (height < 0) & (height > -BACK)
+        close = np.flatnonzero(on | back)
+        mine = np.zeros(len(height), bool)
+        mine[close] = self.beside(view.cells[close], 1)
+        return mine
+
+
+def _planes(view: _View) -> list[_Plane]:
+    """The planes that are no sides of things."""
+    pool, found = np.arange(len(view.cells)), []
+    for _ in range(MOST_PLANES):
+        fit = largest_plane(view.cells[pool], NEAR, fits=3)
+        if fit is None:
+            break
+        plane = _seen_plane(view, pool, fit)
+        if plane.area < LEAST_AREA:
+            break
+        if _is_structure(view, plane, found):
+            found.append(plane)
+            pool = pool[~plane.owns(view)[pool]]
+        pool = np.setdiff1d(pool, plane.own, assume_unique=True)
+    return found
+
+
+def _seen_plane(view: _View, pool: Int[np.ndarray, " p"], fit: Float[np.ndarray, "4"]) -> _Plane:
+    height = view.cells[pool] @ fit[:3] - fit[3]
+    facing = np.abs(view.normals[pool] @ fit[:3]) > TILTED
+    close = np.abs(height) < 2.5 * NEAR
+    spread = 1.4826 * float(np.median(np.abs(height[close & facing]))) if (close & facing).any() else 0.0
+    thick = float(np.clip(3 * spread, LEAST_THICK, MOST_THICK))
+    own = pool[(np.abs(height) <= thick) & facing]
+    axes = np.linalg.svd(fit[None, :3])[2][1:]
+    along = view.cells[own] @ axes.T
+    corner = along.min(0) if len(own) else np.zeros(2)
+    at = np.floor((along - corner) / PATCH).astype(int)
+    patch = np.zeros(at.max(0, initial=0) + 1, bool)
+    patch[tuple(at.T)] = True
+    # Planes through the sides of several things are made of patches that stand apart: the largest counts, and of a table, which
+    # shadows part, others as well.
+    pieces, count = ndimage.label(ndimage.binary_closing(np.pad(patch, 2), iterations=2), np.ones((3, 3)))  # type: ignore
+    pieces = pieces[2:-2, 2:-2]
+    sizes = np.bincount(pieces[patch], minlength=count + 1)
+    certain = sizes.max() * PATCH**2 >= CERTAIN_AREA
+    large = np.flatnonzero(sizes >= (0.1 if certain else 1.0) * max(1, sizes.max()))
+    patch &= np.isin(pieces, large)
+    own = own[patch[tuple(at.T)]]
+    side = view.camera @ fit[:3] - fit[3] if view.camera is not None else float(
+        (height > thick).sum() - (height < -thick).sum())
+    return _Plane(fit if side >= 0 else -fit, thick, axes, corner, patch, float(sizes.max()) * PATCH**2, own)
+
+
+def _is_structure(view: _View, plane: _Plane, found: list[_Plane]) -> bool:
+    """Whether a plane is a table, a board or a wall, and no side of a thing."""
+    if plane.area >= CERTAIN_AREA or (not found and plane.area >= FIRST_AREA):
+        return True
+    if not found:
+        return False
+    # A wall or a board meets the largest plane at a right angle, or lies along it, and is about as long.
+    base = found[0]
+    cosine = abs(float(plane.plane[:3] @ base.plane[:3]))
+    if not (cosine < 0.2 or cosine > 0.97):
+        return False
+    points, ground = view.cells[plane.own], view.cells[base.own]
+    longest = float(np.hypot(*np.ptp(np.quantile(points @ plane.axes.T, [0.02, 0.98], axis=0), axis=0)))
+    if longest < (LEAST_WALL if cosine < 0.2 else LEAST_BOARD):
+        return False
+    if cosine > 0.97:
+        return plane.area >= LEAST_BOARD_AREA
+    along = np.cross(plane.plane[:3], base.plane[:3])
+    along = along / np.linalg.norm(along)
+    low, high = np.quantile(points @ along, [0.02, 0.98])
+    if high - low < SPANS * float(np.ptp(np.quantile(ground @ along, [0.02, 0.98]))):
+        return False
+    # The face of a box has more of the table behind it, a wall has none.
+    within = ground[(ground @ along > low) & (ground @ along < high)]
+    return float((plane.height(within) < -BACK).mean()) < 0.1 if len(within) else True
+
+
+def _things(
+    view: _View, rest: Int[np.ndarray, " r"], planes: list[Float[np.ndarray, "4"]]
+) -> tuple[Int[np.ndarray, " r"], tuple[bool, ...]]:
+    """The label of each cube that is left, and whether a seam parts each thing."""
+    cells = view.cells[rest]
+    labels = np.full(len(rest), NOTHING)
+    if not len(rest):
+        return labels, ()
+    pairs = KDTree(cells).query_pairs(max(0.01, LINK * view.edge), output_type="ndarray")
+    core = np.bincount(pairs.ravel(), minlength=len(rest)) >= CORE
+    group = _joined(pairs[core[pairs].all(1)], len(rest))
+    levels = [plane for plane in planes if plane[:3] @ planes[0][:3] > 0.9]
+    _join_floating(cells, group, levels)
+    sizes = np.bincount(group)
+    large = [int(g) for g in np.argsort(-sizes, kind="stable") if sizes[g] >= LEAST_THING]
+    seams: list[bool] = []
+    for g in large:
+        own = group == g
+        if _is_other(cells[own], levels):
+            labels[own] = OTHER
+            continue
+        labels[own] = len(seams)
+        seams.append(_has_seam(view, rest, np.flatnonzero(own), pairs))
+    _take_fragments(cells, labels)
+    return labels, tuple(seams)
+
+
+def _is_other(cells: Float[np.ndarray, "k 3"], levels: list[Float[np.ndarray, "4"]]) -> bool:
+    """Whether something is no thing to grasp: too long, a wall, or below all that things stand on."""
+    longest = float(np.ptp(cells, axis=0).max())
+    if longest > LONGEST_THING or (levels and max(float(np.median(_over(cells, plane))) for plane in levels) < 0):
+        return True
+    over = [low for plane in levels if (low := float(np.quantile(_over(cells, plane), 0.02))) > 0]
+    if longest <= (LEAST_WALL if over and min(over) > FLOATS else LONGEST_FACE):
+        return False
+    fit = largest_plane(cells, NEAR)
+    return fit is not None and float((np.abs(_over(cells, fit)) < MOST_THICK).mean()) > 0.85
+
+
+def _over(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:
+    return points @ plane[:3] - plane[3]
+
+
+def _join_floating(
+    cells: Float[np.ndarray, "r 3"], group: Int[np.ndarray, " r"], levels: list[Float[np.ndarray, "4"]]
+) -> None:
+    """Join what floats to what is below it, in place: a thing may hide its own middle."""
+    if not levels:
+        return
+    sizes = np.bincount(group)
+    flat = np.linalg.svd(levels[0][None, :3])[2][1:]
+    for g in np.flatnonzero(sizes >= LEAST_THING):
+        own = cells[group == g]
+        lows = [low for plane in levels if (low := float(np.quantile(_over(own, plane), 0.02))) > 0]
+        if not lows or min(lows) < FLOATS:
+            continue
+        others = np.flatnonzero((group != g) & (sizes[group] >= LEAST_THING))
+        below = others[_over(cells[others], levels[0]) < float(np.quantile(_over(own, levels[0]), 0.02))]
+        if not len(below):
+            continue
+        beside = KDTree(own @ flat.T).query(cells[below] @ flat.T)[0] < UNDER
+        gap = KDTree(own).query(cells[below])[0]
+        near = below[beside & (gap < GAP)]
+        if len(near):
+            group[group == g] = group[near[gap[beside & (gap < GAP)].argmin()]]
+
+
+def _joined(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " count"]:
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _take_fragments(cells: Float[np.ndarray, "r 3"], labels: Int[np.ndarray, " r"]) -> None:
+    """Give scattered cubes to the thing beside them, in place."""
+    things, scattered = np.flatnonzero(labels >= 0), np.flatnonzero(labels == NOTHING)
+    if len(things) and len(scattered):
+        away, nearest = KDTree(cells[things]).query(cells[scattered])
+        near = np.flatnonzero(away < FRAGMENT)
+        labels[scattered[near]] = labels[things[np.asarray(nearest)[near]]]
+
+
+def _has_seam(
+    view: _View, rest: Int[np.ndarray, " r"], own: Int[np.ndarray, " o"], pairs: Int[np.ndarray, "p 2"]
+) -> bool:
+    """Whether a thing falls into two large parts where its surface turns inward; unknown without a camera's place."""
+    if view.camera is None:
+        return False
+    place = np.full(len(rest), -1)
+    place[own] = np.arange(len(own))
+    mine = place[pairs[(place[pairs] >= 0).all(1)]]
+    cells, normals = view.cells[rest[own]], view.normals[rest[own]]
+    i, j = mine.T
+    between = cells[j] - cells[i]
+    between = between / np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
+    # Normals of a convex surface turn away from each other, those at a seam towards each other.
+    inward = ((normals[i] - normals[j]) * between).sum(1)
+    seam = np.bincount(mine[inward > CONCAVE].ravel(), minlength=len(own)) > 0
+    smooth = mine[~seam[mine].any(1)]
+    sizes = sorted(np.bincount(_joined(smooth, len(own))).tolist(), reverse=True)
+    return len(sizes) > 1 and sizes[1] >= PART * len(own)

@@ -1,0 +1,36 @@
+"""One object out of a scene: its unseen side completed, without what would be in the table or in other things."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from dro_grasp.geometry.table_plane import moved_plane
+from dro_grasp.objects.loading import cloud_object
+from dro_grasp.objects.perception.choosing import Chosen, Sight
+from dro_grasp.objects.perception.scan import scanned_object
+from dro_grasp.objects.perception.segmentation import Segments
+from dro_grasp.objects.shape import ObjectModel
+
+CLEAR = 0.006  # Completed points nearer to what was seen of other things are left out [m] (ours)
+
+
+def taken_object(name: str, sight: Sight, segments: Segments, chosen: Chosen) -> ObjectModel:
+    """The object of the chosen points in the scene's frame, with the plane below it as its table."""
+    points = sight.points[chosen.own]
+    table = None if chosen.below is None else moved_plane(segments.planes[chosen.below], sight.T)
+    if not sight.from_camera:
+        obj = cloud_object(name, points, origin=name, keep_table=True)
+        return replace(obj, table=table, notes=(*obj.notes, *chosen.notes))
+    up = sight.T[2, :3] if chosen.below is None else segments.planes[chosen.below][:3]
+    whole = scanned_object(name, points, sight.T, keep_table=True, up=up)
+    cloud, kept = whole.cloud.astype(np.float64), np.ones(len(whole.cloud), bool)
+    if table is not None:
+        kept &= cloud @ table[:3] > table[3]
+    if len(chosen.others):
+        kept &= KDTree(sight.world()[chosen.others]).query(cloud)[0] > CLEAR
+    rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[kept]
+    obj = cloud_object(name, rows, origin=name, keep_table=True, seen=whole.seen)
+    return replace(obj, table=table, notes=(*whole.notes, *chosen.notes))

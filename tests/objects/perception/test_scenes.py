@@ -1,0 +1,214 @@
+"""Scenes with known labels: what is found of the object that is asked for, and what is said where it is uncertain."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.scan import scanned_object
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import load_scene
+from dro_grasp.pictures.scene import draw_scene
+from tests.helpers.made_scenes import MadeScene, looking, make_scene, overlap, render_scene
+
+WELL = 0.9  # Intersection over union of an object that is found
+
+
+def _table(*middles: tuple[float, float], height: float = 0.1, spacing: float = 0.004) -> np.ndarray:
+    """A table of 0.8 x 0.6 m at z = 0, seen from all sides, with boxes of 6 cm."""
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, spacing), np.arange(-0.3, 0.3, spacing))
+    parts = [np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)]
+    for middle in middles:
+        box = trimesh.creation.box((0.06, 0.06, height))
+        box.apply_translation((*middle, height / 2))
+        parts.append(np.asarray(trimesh.sample.sample_surface(box, 4000, seed=0)[0]))
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize(("place", "seed", "view"), [("table", 15, 1), ("shelf", 16, 2), ("bin", 14, 1)])
+def test_each_object_is_found_by_its_place_and_all_else_is_avoided(place: str, seed: int, view: int) -> None:
+    made = make_scene(place, 4, seed, view, width=480)  # type: ignore[arg-type]
+    scene = made.load()
+    found = [scene.chosen(at=tuple(middle)) for middle in made.middles]
+    assert len(found) >= 3
+    for k, chosen in enumerate(found):
+        assert overlap(made, k, chosen.pixels) > WELL
+        others = [i for i in range(len(found)) if i != k]
+        assert scene.sight is not None
+        avoided = made.owner.ravel()[scene.sight.pixels[chosen.others]]
+        for i in others:  # every other object is an obstacle
+            assert (avoided == i).sum() > 0.9 * (made.owner == i).sum()
+        assert (avoided == k).sum() < 0.05 * (made.owner == k).sum()
+
+
+def test_a_pixel_a_mask_and_a_place_mean_the_same_thing() -> None:
+    made = make_scene("table", 3, 9, 1, width=480)
+    scene = made.load()
+    row, column = (int(np.median(x)) for x in np.nonzero(made.owner == 1))
+    by_place = scene.chosen(at=tuple(made.middles[1]))
+    by_pixel = scene.chosen(pixel=(column, row))
+    by_mask = scene.chosen(mask=made.owner == 1)
+    assert overlap(made, 1, by_place.pixels) > WELL
+    np.testing.assert_array_equal(by_pixel.own, by_place.own)
+    assert overlap(made, 1, by_mask.pixels) > WELL
+
+
+def test_the_nearest_is_the_one_nearest_to_the_camera() -> None:
+    made = make_scene("table", 3, 9, 1, width=480)
+    depths = [np.nanmin(made.depth[made.owner == k]) for k in range(len(made.names))]
+    assert overlap(made, int(np.argmin(depths)), made.load().chosen(nearest=True).pixels) > WELL
+
+
+def test_the_object_stands_on_its_table_in_the_named_frame() -> None:
+    made = make_scene("table", 3, 9, 1, width=480)
+    found = made.load().object_at(tuple(made.middles[0]))
+    true = load_object(made.names[0])
+    table = found.obj.table
+    assert table is not None
+    np.testing.assert_allclose(table, (0, 0, 1, 0), atol=0.01)  # within noise [m]
+    assert found.obj.cloud[:, 2].min() > -0.005
+    middle = (found.obj.cloud.min(0) + found.obj.cloud.max(0)) / 2
+    assert np.linalg.norm(middle - made.middles[0]) < 0.02
+    assert abs(np.ptp(found.obj.cloud[:, 2]) - true.extents[2]) < 0.015
+    assert found.obstacles is not None
+    # Hands stay above the table by another way: it is no obstacle.
+    others = made.owner.ravel()[made.load().sight.pixels[found.chosen.others]] == -1  # type: ignore[union-attr]
+    on = np.abs(made.load().sight.world()[found.chosen.others][others, 2]) < 0.015  # type: ignore[union-attr]
+    assert on.sum() < 0.01 * (made.owner == -1).sum()
+
+
+def _saved(made: MadeScene, folder: Path, unit: float | None = None) -> Path:
+    camera = {"frame": "world", "T_frame_camera": made.camera.T_frame_camera.tolist(),
+              "intrinsics": np.asarray(made.camera.intrinsics).tolist()}
+    (folder / "camera.json").write_text(json.dumps(camera | ({} if unit is None else {"depth_unit": unit})))
+    return folder / "camera.json"
+
+
+@pytest.mark.parametrize(("name", "unit"), [("d.png", None), ("d.png", 0.0002), ("d.tiff", None), ("d.npy", None)])
+def test_depth_files_give_the_same_points(name: str, unit: float | None, tmp_path: Path) -> None:
+    made = make_scene("table", 1, 0, width=160)
+    depth = np.where(made.depth < 5, made.depth, np.nan)
+    camera = _saved(made, tmp_path, unit)
+    if name == "d.npy":
+        np.save(tmp_path / name, depth)
+    elif name == "d.tiff":
+        Image.fromarray(depth.astype(np.float32)).save(tmp_path / name)
+    else:
+        Image.fromarray(np.nan_to_num(depth / (unit or 0.001)).round().astype(np.uint16)).save(tmp_path / name)
+    scene = load_scene(tmp_path / name, camera=camera)
+    K = np.asarray(made.camera.intrinsics)
+    row, column = np.nonzero(np.isfinite(depth))
+    z = depth[row, column]
+    true = np.stack([(column - K[0, 2]) * z / K[0, 0], (row - K[1, 2]) * z / K[1, 1], z], 1)
+    assert scene.sight is not None
+    np.testing.assert_allclose(scene.sight.points, true, atol=0.001)  # [m], of rounding
+
+
+def test_depth_without_intrinsics_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "depth.npy", np.ones((48, 64)))
+    with pytest.raises(OptionError, match="give its camera with intrinsics"):
+        load_scene(tmp_path / "depth.npy")
+
+
+def test_an_eight_bit_image_is_no_depth(tmp_path: Path) -> None:
+    made = make_scene("table", 1, 0, width=160)
+    Image.fromarray(np.zeros((120, 160), np.uint8)).save(tmp_path / "d.png")
+    with pytest.raises(ObjectError, match="8 bit a pixel, and is no depth image"):
+        load_scene(tmp_path / "d.png", camera=_saved(made, tmp_path))
+
+
+def test_without_a_choice_the_things_are_listed() -> None:
+    scene = load_scene(_table((0.2, 0.1), (-0.2, -0.1)))
+    with pytest.raises(ObjectError, match=r"shows 2 things .*at 0\.20 0\.10 0\.0.*at=\(X, Y, Z\).*nearest=True"):
+        scene.object_at()
+    assert scene.object_at((0.2, 0.1, 0.05)).obj.table is not None
+
+
+def test_one_thing_needs_no_choice() -> None:
+    found = load_scene(_table((0.2, 0.1))).object_at()
+    np.testing.assert_allclose(found.obj.cloud[:, :2].mean(0), (0.2, 0.1), atol=0.005)
+
+
+def test_a_place_where_nothing_is_says_what_there_is() -> None:
+    with pytest.raises(ObjectError, match=r"no thing within 5 cm of -0\.20 0\.20 0\.00: the nearest is .* cm away"):
+        load_scene(_table((0.2, 0.1))).object_at((-0.2, 0.2, 0.0))
+
+
+def test_a_bare_table_shows_nothing() -> None:
+    with pytest.raises(ObjectError, match=r"nothing stands out .*1 plane"):
+        load_scene(_table()).object_at()
+
+
+def test_a_pixel_of_the_table_says_so() -> None:
+    made = make_scene("table", 1, 0, width=320)
+    with pytest.raises(ObjectError, match="shows a table, board or wall"):
+        made.load().object_at(pixel=(160, 200) if made.owner[200, 160] == -1 else (60, 200))
+
+
+def test_two_boxes_that_touch_are_uncertain_and_one_alone_is_not() -> None:
+    low, tall = trimesh.creation.box((0.08, 0.14, 0.06)), trimesh.creation.box((0.06, 0.06, 0.16))
+    low.apply_translation((0, 0, 0.03))
+    tall.apply_translation((0.07, 0, 0.08))
+    one, two = (render_scene("table", boxes, ("box",) * len(boxes), np.random.default_rng(0), 2)
+                for boxes in ([tall], [low, tall]))
+    assert not any("touch" in note for note in one.load().chosen().notes)
+    assert any("two things that touch" in note for note in two.load().chosen().notes)
+
+
+def test_what_reaches_the_border_is_cut_off() -> None:
+    made = make_scene("table", 1, 12, width=480)
+    middle = int(np.median(np.nonzero((made.owner == 0).any(0))[0]))
+    whole = made.load().chosen()
+    assert not any("cut off" in note for note in whole.notes)
+    K = np.asarray(made.camera.intrinsics) - [[0, 0, middle], [0, 0, 0], [0, 0, 0]]
+    camera = SceneCamera(made.camera.T_frame_camera, K, "world")
+    half = load_scene(made.depth[:, middle:], camera=camera).chosen(nearest=True)
+    assert any("the image's border and may be cut off" in note for note in half.notes)
+
+
+def test_two_choices_contradict() -> None:
+    with pytest.raises(OptionError, match="at and nearest each say"):
+        load_scene(_table((0, 0))).object_at((0, 0, 0), nearest=True)
+
+
+def test_a_mesh_is_no_view() -> None:
+    with pytest.raises(ObjectError, match="is a mesh; give what a camera saw"):
+        load_scene(trimesh.creation.box((1, 1, 1))).object_at()
+
+
+def test_a_scene_given_as_an_object_is_told_apart() -> None:
+    # A wall, a table and a thing in 0.9 m: no table is found by its share, and the whole was one object.
+    y, z = np.meshgrid(np.arange(-0.3, 0.3, 0.004), np.arange(-0.4, 0.5, 0.004))
+    wall = np.stack([np.full(y.size, 0.4), y.ravel(), z.ravel()], 1)
+    room = np.concatenate([_table((0.0, 0.0), (-0.2, 0.1)), wall])
+    with pytest.raises(ObjectError, match=re.escape("is a scene, and no object") + ".*scene=FILE"):
+        load_object(room)
+    camera = looking(np.array([-1.0, 0.0, 0.8]), np.zeros(3))
+    with pytest.raises(ObjectError, match="scene=FILE"):
+        scanned_object("room", (room - camera[:3, 3]) @ camera[:3, :3], camera)
+    assert load_object(room, keep_table=True).is_cloud
+
+
+def test_a_thing_alone_is_an_object() -> None:
+    long = trimesh.creation.box((0.9, 0.05, 0.05))
+    assert load_object(np.asarray(trimesh.sample.sample_surface(long, 3000, seed=0)[0])).is_cloud
+
+
+def test_the_picture_shows_object_table_and_obstacles(tmp_path: Path) -> None:
+    made = make_scene("table", 3, 9, 1, width=320)
+    scene = made.load()
+    draw_scene(scene, scene.object_at(tuple(made.middles[0])), tmp_path / "scene.png")
+    with Image.open(tmp_path / "scene.png") as image:
+        picture = np.asarray(image).astype(int)[:500, :640]
+    red, _, blue = np.moveaxis(picture, 2, 0)
+    assert (red > blue + 60).sum() > 300  # orange
+    assert (blue > red + 60).sum() > 300  # blue
+    assert ((np.abs(red - blue) < 25) & (red < 230)).sum() > 5000  # grey
