@@ -57,12 +57,14 @@ class HoldConfig(Checked):
 
     encoder: float = 0.02
     """Standard deviation of measured joints, and of where an empty hand stops [rad, or a share of a sliding joint's unit]."""
-    sensor: float = 0.1
-    """Standard deviation of measured efforts, as a share of the largest expected one [1]."""
+    sensor: float = 0.3
+    """Standard deviation of measured efforts, as a share of the largest expected one; nobody knows servos exactly [1]."""
     spread: float = 0.35
     """Standard deviation of where fingers stop on the object, as a share of the way from there to where an empty hand does."""
     slip: tuple[float, float] = (0.15, 0.9)
     """Shares of the way from where they were to the empty hand's joints that fingers have gone when an object slips [1]."""
+    unsure: float = 0.5
+    """The least such share where nobody measured before: fingers that hold may stop as far from the expected place [1]."""
     priors: tuple[float, float, float] = (0.48, 0.48, 0.04)
     """Probabilities of held, empty and slipping before anything is measured."""
 
@@ -150,6 +152,8 @@ def _log_likelihoods(
     loose = np.hypot(noise, config.spread * (empty - held))
     still = loose if before is None else np.hypot(math.sqrt(2) * noise, 0.1 * way)
     moving = np.hypot(noise, config.spread / 2 * way)
-    places = [(start, still), (empty, noise), *((start + share * way, moving) for share in np.linspace(*config.slip, STEPS))]
+    first, last = config.slip
+    shares = np.linspace(max(first, config.unsure) if before is None else first, last, STEPS)
+    places = [(start, still), (empty, noise), *((start + share * way, moving) for share in shares)]
     errors, spreads = (np.stack(rows) for rows in zip(*((measured - place, spread) for place, spread in places), strict=True))
     return -((errors / spreads) ** 2 / 2 + np.log(spreads)).sum(1)
