@@ -197,15 +197,11 @@ def test_a_free_place_of_the_table_is_chosen(robot: dro.Robot, standing: Standin
         assert float(wall.distance_field.distances(torch.from_numpy(moved).float()[None])[0].min()) > 0.02
     with pytest.raises(PlanError, match="nothing is called 'shelf' to put the object on; there are 'table', 'wall'"):
         places(robot, standing, "shelf", wall)
-    full = box_over(robot, wall)
+    tile = np.stack(np.meshgrid(np.arange(0, 0.3, 0.02), np.arange(0, 0.3, 0.02), [0.05]), -1).reshape(-1, 3)
+    tiles = [cloud_object("tile", tile + (x, y, 0), origin="tile", keep_table=True)
+             for x in np.arange(-0.2, 1.1, 0.3) for y in np.arange(-0.7, 0.7, 0.3)]
     with pytest.raises(PlanError, match="'can' fits nowhere on 'table', 15 cm from where it stands"):
-        places(robot, standing, "table", full)
-
-
-def box_over(robot: dro.Robot, wall: dro.ObjectModel) -> dro.ObjectModel:
-    """A cloud that covers the table."""
-    grid = np.stack(np.meshgrid(np.arange(-0.2, 1.1, 0.02), np.arange(-0.7, 0.71, 0.02), [0.05]), -1).reshape(-1, 3)
-    return cloud_object("full", grid, origin="full", keep_table=True)
+        places(robot, standing, "table", *tiles)
 
 
 @pytest.mark.parametrize("as_cloud", [False, True])
@@ -242,9 +238,8 @@ def plan_grasps(robot: dro.Robot, made: MotionPlan) -> dro.GraspBatch:
     joints = torch.from_numpy(made.scene.joints).float()
     close = made.hand.position[made.part("close")]
     first, last = (torch.from_numpy(row).float().expand_as(joints) for row in close[[0, -1]])
-    empty = dro.GraspBatch.none(robot.hand, dro.load_object("can"))
-    return empty.replace(T_object_wrist=torch.from_numpy(made.scene.T_world_wrist).float(), joints=joints,
-                         pregrasp_joints=first, squeeze_joints=last)
+    wrists = torch.from_numpy(made.scene.T_world_wrist).float()
+    return dro.GraspBatch.create(robot.hand, dro.load_object("can"), wrists, joints, pregrasp_joints=first, squeeze_joints=last)
 
 
 def test_errors_of_a_place_are_measured_about_the_centre_of_mass(robot: dro.Robot, placed: MotionPlan) -> None:
