@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -126,7 +127,7 @@ def test_efforts_end_with_the_release_and_files_keep_the_stages(
     assert {row.split(",")[1] for row in dro.trajectory_csv(again).splitlines()[1:]} == set(ALL_STAGES)
     assert list(again.points(20))[-1].stage == "retreat"
     film = Film.of_plan(robot, again)
-    np.testing.assert_allclose(film.poses[-1, 0], placed.notes.place, atol=2e-3)
+    np.testing.assert_allclose(film.poses[-1, 0], np.array(placed.notes.place), atol=2e-3)
     np.testing.assert_allclose(film.poses[0, 0], np.eye(4))
 
 
@@ -137,7 +138,8 @@ def test_plan_files_of_before_are_read(planned: MotionPlan, tmp_path: Path) -> N
     header = json.loads(str(arrays["header"]))
     del header["place"]
     for version, is_read in ((2, True), (1, False)):
-        np.savez(tmp_path / "old.npz", **arrays | {"header": np.array(json.dumps(header | {"format_version": version}))})
+        old: dict[str, Any] = arrays | {"header": np.array(json.dumps(header | {"format_version": version}))}
+        np.savez(tmp_path / "old.npz", **old)
         if is_read:
             assert MotionPlan.load(tmp_path / "old.npz").stages == STAGES
         else:
@@ -198,7 +200,7 @@ def test_a_free_place_of_the_table_is_chosen(robot: dro.Robot, standing: Standin
     with pytest.raises(PlanError, match="nothing is called 'shelf' to put the object on; there are 'table', 'wall'"):
         places(robot, standing, "shelf", wall)
     tile = np.stack(np.meshgrid(np.arange(0, 0.3, 0.02), np.arange(0, 0.3, 0.02), [0.05]), -1).reshape(-1, 3)
-    tiles = [cloud_object("tile", tile + (x, y, 0), origin="tile", keep_table=True)
+    tiles = [cloud_object("tile", tile + np.array([x, y, 0]), origin="tile", keep_table=True)
              for x in np.arange(-0.2, 1.1, 0.3) for y in np.arange(-0.7, 0.7, 0.3)]
     with pytest.raises(PlanError, match="'can' fits nowhere on 'table', 15 cm from where it stands"):
         places(robot, standing, "table", *tiles)
