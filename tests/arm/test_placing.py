@@ -180,6 +180,7 @@ def test_an_impossible_place_is_refused_with_the_distance(
     assert message in str(caught.value)
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("given", [(0.5, 0.1), (0.5, 0.1, math.nan), (1, 2, 3, 4, 5), (1, 2, "x"), 7])
 def test_what_is_no_place_is_refused(robot: dro.Robot, standing: Standing, given: object) -> None:
     with pytest.raises(OptionError, match="give X Y Z of the object's foot in metres"):
