@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -126,7 +127,7 @@ def test_efforts_end_with_the_release_and_files_keep_the_stages(
     assert {row.split(",")[1] for row in dro.trajectory_csv(again).splitlines()[1:]} == set(ALL_STAGES)
     assert list(again.points(20))[-1].stage == "retreat"
     film = Film.of_plan(robot, again)
-    np.testing.assert_allclose(film.poses[-1, 0], placed.notes.place, atol=2e-3)
+    np.testing.assert_allclose(film.poses[-1, 0], np.array(placed.notes.place), atol=2e-3)
     np.testing.assert_allclose(film.poses[0, 0], np.eye(4))
 
 
@@ -137,7 +138,8 @@ def test_plan_files_of_before_are_read(planned: MotionPlan, tmp_path: Path) -> N
     header = json.loads(str(arrays["header"]))
     del header["place"]
     for version, is_read in ((2, True), (1, False)):
-        np.savez(tmp_path / "old.npz", **arrays | {"header": np.array(json.dumps(header | {"format_version": version}))})
+        old: dict[str, Any] = arrays | {"header": np.array(json.dumps(header | {"format_version": version}))}
+        np.savez(tmp_path / "old.npz", **old)
         if is_read:
             assert MotionPlan.load(tmp_path / "old.npz").stages == STAGES
         else:
@@ -178,6 +180,7 @@ def test_an_impossible_place_is_refused_with_the_distance(
     assert message in str(caught.value)
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("given", [(0.5, 0.1), (0.5, 0.1, math.nan), (1, 2, 3, 4, 5), (1, 2, "x"), 7])
 def test_what_is_no_place_is_refused(robot: dro.Robot, standing: Standing, given: object) -> None:
     with pytest.raises(OptionError, match="give X Y Z of the object's foot in metres"):
@@ -197,15 +200,11 @@ def test_a_free_place_of_the_table_is_chosen(robot: dro.Robot, standing: Standin
         assert float(wall.distance_field.distances(torch.from_numpy(moved).float()[None])[0].min()) > 0.02
     with pytest.raises(PlanError, match="nothing is called 'shelf' to put the object on; there are 'table', 'wall'"):
         places(robot, standing, "shelf", wall)
-    full = box_over(robot, wall)
+    tile = np.stack(np.meshgrid(np.arange(0, 0.3, 0.02), np.arange(0, 0.3, 0.02), [0.05]), -1).reshape(-1, 3)
+    tiles = [cloud_object("tile", tile + np.array([x, y, 0]), origin="tile", keep_table=True)
+             for x in np.arange(-0.2, 1.1, 0.3) for y in np.arange(-0.7, 0.7, 0.3)]
     with pytest.raises(PlanError, match="'can' fits nowhere on 'table', 15 cm from where it stands"):
-        places(robot, standing, "table", full)
-
-
-def box_over(robot: dro.Robot, wall: dro.ObjectModel) -> dro.ObjectModel:
-    """A cloud that covers the table."""
-    grid = np.stack(np.meshgrid(np.arange(-0.2, 1.1, 0.02), np.arange(-0.7, 0.71, 0.02), [0.05]), -1).reshape(-1, 3)
-    return cloud_object("full", grid, origin="full", keep_table=True)
+        places(robot, standing, "table", *tiles)
 
 
 @pytest.mark.parametrize("as_cloud", [False, True])
@@ -242,9 +241,8 @@ def plan_grasps(robot: dro.Robot, made: MotionPlan) -> dro.GraspBatch:
     joints = torch.from_numpy(made.scene.joints).float()
     close = made.hand.position[made.part("close")]
     first, last = (torch.from_numpy(row).float().expand_as(joints) for row in close[[0, -1]])
-    empty = dro.GraspBatch.none(robot.hand, dro.load_object("can"))
-    return empty.replace(T_object_wrist=torch.from_numpy(made.scene.T_world_wrist).float(), joints=joints,
-                         pregrasp_joints=first, squeeze_joints=last)
+    wrists = torch.from_numpy(made.scene.T_world_wrist).float()
+    return dro.GraspBatch.create(robot.hand, dro.load_object("can"), wrists, joints, pregrasp_joints=first, squeeze_joints=last)
 
 
 def test_errors_of_a_place_are_measured_about_the_centre_of_mass(robot: dro.Robot, placed: MotionPlan) -> None:

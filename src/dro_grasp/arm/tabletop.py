@@ -627,7 +627,7 @@ def lifted(attempts: Sequence[Attempt]) -> list[Attempt]:
 
 def placing_errors(attempts: Sequence[Attempt]) -> dict[str, float] | None:
     """Median errors of the placed objects [m and degrees], and the number placed; None if none was."""
-    rows = [(a.place_error, a.place_tilt) for a in attempts if a.place_error is not None]
+    rows = [(a.place_error, a.place_tilt or 0.0) for a in attempts if a.place_error is not None]
     if not rows:
         return None
     error, tilt = np.median(rows, axis=0).tolist()
