@@ -172,7 +172,7 @@ def test_a_stated_mass_is_lifted_and_planned_for(
         scenes.append(scene)
         return honest(scene, *rest)
 
-    def unplanned(robot: dro.Robot, obj: dro.ObjectModel, *rest: Any) -> None:
+    def unplanned(robot: dro.Robot, obj: dro.ObjectModel, *rest: Any, place: None) -> None:
         known.append(obj)
         raise dro.DroGraspError("not planned")
 
