@@ -9,6 +9,7 @@ import math
 import pkgutil
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Literal
 
@@ -21,11 +22,13 @@ from dro_grasp.errors import OptionError
 from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, checked, plain, renamed
 from dro_grasp.network.presets import NetworkConfig
 
+OF_A_GPU = ("dro_grasp.network.fused",) if find_spec("triton") is None else ()  # PyTorch without CUDA comes without Triton
+
 
 def configurations() -> Iterator[type]:
     """Every configuration in the package, and what else users fill."""
     for module in pkgutil.walk_packages(dro.__path__, "dro_grasp."):
-        if not module.name.startswith(("dro_grasp.cli", "dro_grasp.__main__")):
+        if not module.name.startswith(("dro_grasp.cli", "dro_grasp.__main__")) and module.name not in OF_A_GPU:
             for name, value in vars(importlib.import_module(module.name)).items():
                 named = name.endswith("Config") or name in {"Constraints", "GraspRequest", "Protocol", "Perturbations"}
                 if named and inspect.isclass(value) and value.__module__ == module.name and value is not NetworkConfig:

@@ -16,7 +16,8 @@ from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import wxyz
 from dro_grasp.grasps.export.writers import yaml_text
 
-ARM, HAND = "arm", "hand"  # Names of the groups of joints
+ARM = "arm"  # Name of the group of the arm's joints
+HAND = "hand"  # And of those of the hand
 SHORTEST = 0.001  # Straight motions that are shorter are none [m] (ours)
 
 
