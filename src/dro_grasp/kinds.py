@@ -59,7 +59,8 @@ def plain(name: str, given: Any, kind: Any) -> Any:
     options = [each for each in _members(kind) if get_origin(each) is Literal]
     told = " ".join((given if options and isinstance(given, str) else repr(given)).split())[:MAX_QUOTED_CHARS]
     if options:
-        raise OptionError(f"{name} is '{told}'; choose {', '.join(map(str, get_args(options[0])))}")
+        numbers = [f"give {WORDS[each]}, or " for each in _members(kind) if each in (int, float)]
+        raise OptionError(f"{name} is '{told}'; {''.join(numbers)}choose {', '.join(map(str, get_args(options[0])))}")
     raise OptionError(f"{name} is {told}; give {' or '.join(_words(each) for each in _members(kind))}")
 
 
