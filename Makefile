@@ -72,6 +72,7 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 8 --seed 0 --picture docs/pictures/grasps.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 --video docs/pictures/lift.webp
+	$(BIN)/dro-grasp clear --robot xarm7_leaphand --objects builtin:train --things 5 --video docs/pictures/clear.webp
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
 	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png

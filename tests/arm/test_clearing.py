@@ -11,7 +11,7 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp.arm import clearing
-from dro_grasp.arm.clearing import Bin, ClearConfig, Pick, clear
+from dro_grasp.arm.clearing import Bin, ClearConfig, Pick, clear_table
 from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.errors import OptionError, PlanError
@@ -99,7 +99,7 @@ def world(monkeypatch: pytest.MonkeyPatch, robot: dro.Robot, placed: MotionPlan)
 def test_everything_is_picked_and_dropped_above_the_bin(world: Any, robot: dro.Robot) -> None:
     table, asked = world([True] * 4)
     told, judged = list[Pick](), list[Any]()
-    result = clear(robot, table, NOBODY, progress=told.append, judged=judged.append)
+    result = clear_table(robot, table, NOBODY, progress=told.append, judged=judged.append)
     assert [pick.stage for pick in result.picks] == ["done", "done"]
     assert (result.picks, result.left, result.done) == (tuple(told), (), 2)
     assert (table.there, table.looks, len(judged)) == ({}, 3, 4)
@@ -117,7 +117,7 @@ def test_everything_is_picked_and_dropped_above_the_bin(world: Any, robot: dro.R
 
 def test_what_is_lost_is_looked_for_and_tried_again(world: Any, robot: dro.Robot) -> None:
     table, asked = world([False, True, True, True, True])
-    result = clear(robot, table, NOBODY, seed=5)
+    result = clear_table(robot, table, NOBODY, seed=5)
     assert [pick.stage for pick in result.picks] == ["lift", "done", "done"]
     assert result.picks[0].reason == "the hand is empty, by its joints"
     assert asked[0].name == asked[2].name != asked[1].name, "what has failed least comes first"
@@ -127,7 +127,7 @@ def test_what_is_lost_is_looked_for_and_tried_again(world: Any, robot: dro.Robot
 
 def test_a_thing_is_given_up_after_three_tries_and_the_others_are_not(world: Any, robot: dro.Robot) -> None:
     table, asked = world([True, True], fails=("b",))
-    result = clear(robot, table, NOBODY, ClearConfig(tries=3))
+    result = clear_table(robot, table, NOBODY, ClearConfig(tries=3))
     assert [own.name for own in asked].count("b") == 3
     assert [pick.stage for pick in result.picks].count("done") == 1
     assert [pick.reason for pick in result.left] == ["no grasp of b"]
@@ -136,7 +136,7 @@ def test_a_thing_is_given_up_after_three_tries_and_the_others_are_not(world: Any
 
 def test_picks_have_an_end(world: Any, robot: dro.Robot) -> None:
     table, _ = world([False] * 20)
-    result = clear(robot, table, NOBODY, ClearConfig(most=2, tries=10))
+    result = clear_table(robot, table, NOBODY, ClearConfig(most=2, tries=10))
     assert len(result.picks) == 2
     assert result.done == 0
 

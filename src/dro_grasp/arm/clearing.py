@@ -141,7 +141,7 @@ class Cleared:
 
 
 @checked
-def clear(
+def clear_table(
     robot: Robot, rig: Rig, predictor: GraspPredictor | None = None, config: ClearConfig | None = None, seed: int = 0,
     progress: Callable[[Pick], None] | None = None, judged: Callable[[HoldCheck], None] | None = None,
 ) -> Cleared:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.arm.clearing import ClearConfig, Cleared, Pick, clear
+from dro_grasp.arm.clearing import ClearConfig, Cleared, Pick, clear_table
 from dro_grasp.arm.motion import Trajectory
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.robot import Robot, Table
@@ -104,7 +104,7 @@ def clear_trial(
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
     rig = SimulatedRig(scene, config.noise, seed + 1000 * number, watch)
     judgements = list[tuple[str, bool]]()
-    cleared = clear(robot, rig, predictor, config.clear, seed + 1000 * number, progress,
+    cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, progress,
                     lambda check: judgements.append((check.state, rig.holds())))
     scene.advance(1.0)
     centres = [(T[:3, :3] @ obj.centre_of_mass + T[:3, 3])[None] for i, obj in enumerate(objects) for T in [scene.pose(i)]]
