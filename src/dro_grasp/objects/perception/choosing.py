@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.segmentation import NOTHING, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
