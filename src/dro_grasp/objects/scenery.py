@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
-from dro_grasp.objects.perception.choosing import Chosen, Sight, choose
+from dro_grasp.objects.perception.choosing import Chosen, Pixel, Place, Sight, choose
 from dro_grasp.objects.perception.scene_files import (
     SceneCamera,
     as_camera,
@@ -89,8 +88,7 @@ class Scene:
         return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
 
     def chosen(
-        self, at: Sequence[float] | None = None, pixel: Sequence[float] | None = None, mask: Any = None,
-        nearest: bool = False,
+        self, at: Place | None = None, pixel: Pixel | None = None, mask: Any = None, nearest: bool = False
     ) -> Chosen:
         """Which points are the object's; arguments as for `object_at`."""
         segments = self.segments
@@ -99,7 +97,7 @@ class Scene:
 
     @checked
     def object_at(
-        self, at: Sequence[float] | None = None, *, pixel: Sequence[float] | None = None, mask: Any = None,
+        self, at: Place | None = None, *, pixel: Pixel | None = None, mask: Any = None,
         nearest: bool = False, name: str | None = None,
     ) -> FoundObject:
         """The object that is meant, completed, and all else as obstacles.

@@ -169,13 +169,17 @@ def test_a_filter_that_no_grasp_passes_ends_a_trial_that_plays(
 
 
 @pytest.mark.parametrize("kind", EXPORTS)
-def test_what_is_taken_away_is_what_is_shown(made: module.ShownGrasps, kind: str) -> None:
+def test_what_is_taken_away_is_what_is_shown(made: module.ShownGrasps, kind: str, tmp_path: Path) -> None:
     name, content = exported(made.hand, made.obj, made.refined, kind)
     assert name.startswith("gripper3_sphere")
     if name.endswith(".parquet"):
         assert torch.equal(GraspBatch.load(io.BytesIO(content)).joints, made.refined.joints)
     elif name.endswith(".csv"):
         assert len([x for x in content.decode().splitlines() if not x.startswith("#")]) == 7
+    elif name.endswith(".usd"):
+        (tmp_path / name).write_bytes(content)
+        stage = pytest.importorskip("pxr.Usd").Stage.Open(str(tmp_path / name))
+        assert len(stage.GetPrimAtPath("/World/grasps").GetChildren()) == 6
     else:
         read = yaml.safe_load(content)
         assert len(read["grasps"] if isinstance(read, dict) else read) == 6

@@ -16,6 +16,8 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.segmentation import NOTHING, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
+Place = Sequence[float] | Float[np.ndarray, "3"]  # x, y, z [m]
+Pixel = Sequence[float] | Float[np.ndarray, "2"]  # Column and row, from the upper left
 BESIDE = 0.05  # Longest way from a given place to the thing that is meant [m] (ours)
 ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
 BORDER = 3  # Pixels from the image's border that touch it (ours)
@@ -67,7 +69,7 @@ class Chosen:
 
 
 def choose(
-    name: str, sight: Sight, segments: Segments, at: Sequence[float] | None, pixel: Sequence[float] | None, mask: Any,
+    name: str, sight: Sight, segments: Segments, at: Place | None, pixel: Pixel | None, mask: Any,
     nearest: bool,
 ) -> Chosen:
     """The points of the thing that is meant; see `Scene.object_at`."""
@@ -134,10 +136,10 @@ def _planes(segments: Segments) -> str:
     return f"{len(areas)} {'plane' if len(areas) == 1 else 'planes'} ({', '.join(areas)})" if areas else "no plane"
 
 
-def _at(name: str, sight: Sight, segments: Segments, at: Sequence[float]) -> int:
+def _at(name: str, sight: Sight, segments: Segments, at: Place) -> int:
     place = numbers(at, "at").astype(np.float64)
     if place.shape != (3,) or not np.isfinite(place).all():
-        raise OptionError(f"at is {list(at)}; give x, y and z in metres")
+        raise OptionError(f"at is {place.tolist()}; give x, y and z in metres")
     world, labels = sight.world(), segments.labels
     things = np.flatnonzero(labels >= 0)
     away = np.linalg.norm(world[things] - place, axis=1)
@@ -163,13 +165,13 @@ def _inside(
     return min(found)[1] if found else None
 
 
-def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Sequence[float]) -> int:
+def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> int:
     image, wanted = sight.image(), numbers(pixel, "pixel").astype(np.float64)
     if image is None:
         raise OptionError(f"a pixel is given, and '{name}' is a cloud without an image; state \"intrinsics\" in the camera's "
                           "file, or give a place (at=(X, Y, Z))")
     if wanted.shape != (2,) or not np.isfinite(wanted).all():
-        raise OptionError(f"pixel is {list(pixel)}; give its column and row")
+        raise OptionError(f"pixel is {wanted.tolist()}; give its column and row")
     if sight.shape is not None and not ((wanted >= 0) & (wanted < sight.shape[::-1])).all():
         raise OptionError(f"pixel is {wanted[0]:g} {wanted[1]:g}, beside the image of {sight.shape[1]} x {sight.shape[0]}; "
                           "give its column and row, from the upper left")
