@@ -5,7 +5,8 @@
     in   points     sensor_msgs/PointCloud2       in the frame of the robot file's camera: table and what stands on it
     in   grasp_at   geometry_msgs/PointStamped    near the object that is wanted, in the robot's world; it starts the work
     out  arm, hand  trajectory_msgs/JointTrajectory    with the same times, in the numbers that the drivers take
-    out  squeeze    sensor_msgs/JointState        joints and efforts while the hand holds
+    out  squeeze    sensor_msgs/JointState        targets of the hand while it holds, and their efforts
+    out  held, empty  sensor_msgs/JointState      where its joints are then, with the object in the hand and without
     out  grasps     geometry_msgs/PoseArray       wrists of all grasps that were found, the best first
 
 Send `arm` and `hand` to your controllers yourself, once you have looked at them.
@@ -22,7 +23,8 @@ from scipy.spatial.transform import Rotation
 import dro_grasp as dro
 
 KINDS = {"arm": "trajectory_msgs/JointTrajectory", "hand": "trajectory_msgs/JointTrajectory",
-         "squeeze": "sensor_msgs/JointState", "grasps": "geometry_msgs/PoseArray"}
+         "squeeze": "sensor_msgs/JointState", "held": "sensor_msgs/JointState",
+         "empty": "sensor_msgs/JointState", "grasps": "geometry_msgs/PoseArray"}
 
 
 def planned(robot: dro.Robot, predictor: dro.GraspPredictor, points: np.ndarray, near: tuple[float, float]) -> dict[str, Any]:

@@ -106,7 +106,8 @@ def test_a_place_in_a_cloud_becomes_messages(
     node.calls["grasp_at"](at(0.5, 0.1))
     assert (asked, node.errors) == ([(0.5, 0.1)], [])
     assert {topic: message.kind for topic, message in node.sent.items()} == {
-        "arm": "JointTrajectory", "hand": "JointTrajectory", "squeeze": "JointState", "grasps": "PoseArray"}
+        "arm": "JointTrajectory", "hand": "JointTrajectory", "squeeze": "JointState", "held": "JointState",
+        "empty": "JointState", "grasps": "PoseArray"}
     arm, grasps = node.sent["arm"], node.sent["grasps"]
     assert (arm.joint_names, arm.header.stamp.sec) == (list(planned.notes.arm_joints), 7)
     np.testing.assert_allclose(arm.points[-1].positions, planned.arm.position[-1], atol=1e-6)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from dro_grasp.apps.report import protocol_for
 from dro_grasp.cli.dataset import Synthesize
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
@@ -65,7 +66,7 @@ def test_trials_are_those_of_what_lifts_things_unless_another_protocol_is_named(
 
 
 def test_so_are_those_of_generate() -> None:
-    assert Generate(hand="gripper3", object="sphere")._protocol(load_object("sphere")) == "carry"
+    assert protocol_for(load_object("sphere"), Generate(hand="gripper3", object="sphere").protocol) == "carry"
 
 
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,13 +92,13 @@ def protocol_for(obj: ObjectModel, given: str | None) -> str:
 def require_trial(obj: ObjectModel, given: str | None) -> None:
     """Refuse to keep the successful grasps of an object that gets no trial: OptionError."""
     if protocol_for(obj, given) == NO_TRIAL:
-        raise OptionError(f"--only-successful saves what passed a trial, and '{obj.name}' gets none; name a "
-                          "--protocol, which needs a mesh, or leave out --only-successful")
+        raise OptionError(f"only_successful=True saves what passed a trial, and '{obj.name}' gets none; name a "
+                          "protocol=..., which needs a mesh, or leave out only_successful=...")
 
 
 def doubt(constraints: Constraints, obj: ObjectModel, seen: bool) -> str | None:
     """What is odd about the table, in words; None for nothing. `seen` tells whether a camera's pose is known."""
     if obj.is_cloud and obj.table is None and constraints.table is not None and not seen:
-        return (f"--table {constraints.table:g} counts along the z axis of the cloud. If that is a camera's, which points "
-                "forward, give the camera's pose with --camera")
+        return (f"table={constraints.table:g} counts along the z axis of the cloud. If that is a camera's, which points "
+                "forward, give the camera's pose with camera=...")
     return constraints.warning(obj)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.cli.remote import generate_at, server_of
+from dro_grasp.cli.switches import in_switches
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -256,7 +257,7 @@ class Generate:
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         if (warning := doubt(job.constraints, obj, job.camera is not None)) is not None:
-            say_aside(f"warning: {obj.name}: {warning}")
+            say_aside(in_switches(f"warning: {obj.name}: {warning}"))
         problem = GraspProblem(job.hand, obj, self.device, job.constraints) if first is None else first.beside(obj)
         self._cut(obj)
         return Ready(problem, seconds)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dro_grasp.cli.output import print_json, progress_bar, say_aside
+from dro_grasp.cli.switches import in_switches
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 
@@ -44,7 +45,7 @@ def generate_at(address: str, command: Generate) -> int:
     with progress_bar(f"asking {address}", command.json):
         answer = _answered(address, call)
     for line in answer["warnings"]:
-        say_aside(line)
+        say_aside(in_switches(line))
     report, seconds, middle = answer["report"], answer["seconds"], time.perf_counter()
     if not answer["kept"]:
         command.say_that_none_is_left(report["object"], output, None)

@@ -283,7 +283,7 @@ def _further_column(name: str, value: Any) -> pa.Array:
         links = [() if own is None else own for own in value]
         missing = np.array([own is None for own in value], bool)
         names = text_column([link for own in links for link in own])
-        return list_column(np.cumsum([len(own) for own in links]), names, missing)
+        return list_column(np.cumsum([len(own) for own in links], dtype=np.int64), names, missing)
     if name in TEXTS or (value and all(isinstance(one, str) for one in value)):
         return text_column(value)
     return pa.array(list(value))

@@ -138,6 +138,7 @@ def test_direction_without_length_is_refused(direction: tuple[float, float, floa
         visible_points(ball(), torch.tensor(direction), seeded())
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_impossible_cameras_are_refused():
     with pytest.raises(OptionError, match="is inside the object"):
         visible_points(ball(), torch.tensor([0.0, 0, 1]), seeded(), DepthCamera(distance=0.05))

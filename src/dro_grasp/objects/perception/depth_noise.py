@@ -91,15 +91,15 @@ class DepthNoise(Checked):
         angle, (constant, linear, square) = np.minimum(angle, STEEPEST), self.axial
         slant = self.glance * depth**self.glance_power * (angle / (math.pi / 2 - angle)) ** 2 if self.glance else 0.0
         own = constant + linear * depth + square * depth**2 + slant
-        return np.hypot(own, self.depth_of(self.subpixel, depth))
+        return np.asarray(np.hypot(own, self.depth_of(self.subpixel, depth)))
 
     def depth_of(self, disparity: float, depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """How much depth changes with a small change of the disparity [m]."""
-        return disparity * depth**2 / (self.focal * abs(self.baseline)) if self.baseline else np.zeros_like(depth)
+        return np.asarray(disparity * depth**2 / (self.focal * abs(self.baseline))) if self.baseline else np.zeros_like(depth)
 
     def step(self, depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Distance between the depths that can be stored [m]."""
-        return np.maximum(self.depth_of(self.disparity_step, depth), self.depth_step)
+        return np.asarray(np.maximum(self.depth_of(self.disparity_step, depth), self.depth_step))
 
 
 PRESETS = {

@@ -26,7 +26,6 @@ from dro_grasp.objects.loading import (
     given_normals,
     table_note,
 )
-from dro_grasp.objects.perception.completion import complete_cloud
 from dro_grasp.objects.perception.things import one_thing, refuse_scene
 from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
@@ -157,6 +156,8 @@ def scanned_object(
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
         OptionError: The pose is no rigid motion.
     """
+    from dro_grasp.objects.perception.completion import complete_cloud  # it takes a while, and scenes import this
+
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
     clean = _cleaned(given_points(points, name), name, denoise, keep_table)
     kept, table, camera = clean.rows[:, :3], clean.table, np.zeros(3)
