@@ -102,9 +102,9 @@ def _camera(robot: Robot, recorder: Recorder) -> Camera:
     """A camera that has the whole motion in its picture, and the part of the table around it."""
     moved = [mesh.vertices for arm, hand, _ in recorder.frames[:: max(1, len(recorder.frames) // 8)]
              for mesh in robot_meshes(robot, arm, hand)]
-    places = np.stack([T[0, :3, 3] for _, _, T in recorder.frames])
+    places = np.stack([recorder.frames[row][2][:, :3, 3] for row in (0, -1)])  # of all objects
     table = robot.table or Table()
     square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # [m] (ours)
-    around = (places[[0, -1], None, :2] + square).reshape(-1, 2)
+    around = (places[:, :1, None, :2] + square).reshape(-1, 2)
     corners = np.column_stack([around, np.full(len(around), table.height)])
-    return Camera.around(np.concatenate([*moved, places, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)
+    return Camera.around(np.concatenate([*moved, places.reshape(-1, 3), corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)
