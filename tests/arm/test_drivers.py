@@ -17,23 +17,16 @@ import yaml
 import dro_grasp as dro
 from dro_grasp.arm.drivers import Drivers
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.robot import BUILTIN_ROBOTS, load_robot
+from dro_grasp.arm.robot import load_robot
 from dro_grasp.arm.robot_check import check_robot
 from dro_grasp.errors import RobotError
+from tests.helpers.robot_files import written, xarm7
 from tests.helpers.strange_hands import block, robot as whole, sliding
 
 
 @pytest.fixture
 def values() -> dict[str, Any]:
-    """The built-in xArm 7 with a small hand, with absolute paths."""
-    values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
-    return values | {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
-
-
-def written(values: dict[str, Any], folder: Path) -> Path:
-    path = folder / "robot.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return path
+    return xarm7()
 
 
 def test_zeros_signs_and_units_make_the_drivers_numbers(values: dict[str, Any], tmp_path: Path) -> None:

@@ -17,20 +17,13 @@ from dro_grasp.arm.robot import BUILTIN_ROBOTS, Robot, load_robot, robot_names
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.cli.main import main
 from dro_grasp.errors import RobotError
+from tests.helpers.robot_files import written, xarm7
 from tests.helpers.whole_robot import arm_with_claw, two_arms
 
 
 @pytest.fixture
 def values() -> dict[str, Any]:
-    """The built-in xArm 7, with absolute paths."""
-    values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
-    return values | {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
-
-
-def written(values: dict[str, Any], folder: Path) -> Path:
-    path = folder / "robot.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return path
+    return xarm7()
 
 
 @pytest.mark.parametrize("name", robot_names())

@@ -24,14 +24,15 @@ def test_the_whole_object_is_itself() -> None:
 @pytest.mark.parametrize("view", ["half", "depth"])
 def test_a_view_is_a_cloud_in_the_objects_frame_that_follows_the_seed(view: View) -> None:
     can = load_object("can")
-    first = partial_view(can, view, 3)
-    once, again, other = first.cloud, partial_view(can, view, 3).cloud, partial_view(can, view, 4).cloud
+    camera = DepthCamera(noise=0.001)
+    first, again, other = (partial_view(can, view, seed, camera) for seed in (3, 3, 4))
+    once, again, other = first.cloud, again.cloud, other.cloud
     np.testing.assert_array_equal(once, again)
     assert once.shape != other.shape or np.abs(once - other).max() > 0.005
-    seen, given = first.seen, visible_side(can, view, 3)[0]
+    seen, given = first.seen, visible_side(can, view, 3, camera)[0]
     assert seen is not None
     assert KDTree(given).query(seen)[0].max() < 1e-6
-    assert len(seen) < 0.9 * len(once)
+    assert len(seen) < 0.8 * len(once)
     assert partial_view(can, "cloud", 3).seen is None
     low, high = can.cloud.min(0) - 0.03, can.cloud.max(0) + 0.03
     assert ((once > low) & (once < high)).mean() > 0.9
