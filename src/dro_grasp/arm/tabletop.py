@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan
-from dro_grasp.arm.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
+from dro_grasp.arm.physics import FRICTION, SHAPE_GROUP, TICK, Deviation, LiftScene, check_friction, object_name
 from dro_grasp.arm.placing import AWAY, foot, off_table
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.reachability import ReachConfig
@@ -49,7 +49,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.scene import PREFIX
 
-LABEL = "tabletop/3 "
+LABEL = "tabletop/4 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 APART = 0.03  # Distance between the outlines of objects as they are put down [m] (ours)
 PLACED_WITHIN = 0.02  # Largest distance from its place of an object that is placed [m]. Source: the project's aim (ours)
@@ -84,6 +84,8 @@ class TabletopConfig(Checked):
     """How motions are planned."""
     mass: float | None = None
     """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
+    friction: float = FRICTION
+    """Coefficient of friction between hand, objects and table; what the planner assumes is in `plan`."""
     place: bool = False
     """Whether the object is put down at a random free place of the region, instead of held and shaken."""
 
@@ -104,6 +106,7 @@ class TabletopConfig(Checked):
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
+        check_friction(self.friction)
         if self.mass is not None:
             check_mass(self.mass)
         if not 0 <= self.clutter <= 8:  # there is no room for more
@@ -225,7 +228,7 @@ def attempt(
     _check(robot, obj, config)
     obj = obj if config.mass is None else with_mass(obj, config.mass)
     others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
-    scene = LiftScene(Workcell(robot), [obj, *others])
+    scene = LiftScene(Workcell(robot), [obj, *others], friction=config.friction)
     result = Attempt(robot.name, obj.name, number, seed, config.label())
     draw = np.random.default_rng([seed, number])
     if not scatter(scene, config.region, draw):
@@ -358,13 +361,13 @@ def other_objects(name: str, count: int, draw: np.random.Generator) -> list[Obje
     return [load_object(str(other)) for other in draw.permutation(sorted(set(OBJECTS) - {name}))[:count]]
 
 
-def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:
+def scatter(scene: LiftScene, region: Region, draw: np.random.Generator, apart: float = APART) -> bool:
     """Put all objects down, the first one in the region and others up to 10 cm around it; False if one never comes to rest."""
     wide = (region[0] - 0.05, region[1] - 0.10, region[2] + 0.10, region[3] + 0.10)
-    return all(rest(scene, index, wide if index else region, draw) for index in range(len(scene.objects)))
+    return all(rest(scene, index, wide if index else region, draw, apart) for index in range(len(scene.objects)))
 
 
-def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator) -> bool:
+def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator, apart: float = APART) -> bool:
     """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
     low, high = np.array(region[:2]), np.array(region[2:])
     table, obj = scene.robot.table or Table(), scene.objects[index]
@@ -373,7 +376,7 @@ def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator
         generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
         T = np.eye(4)
         T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
-        T[:2, 3] = _free_place(scene, index, T, region, draw)
+        T[:2, 3] = _free_place(scene, index, T, region, draw, apart)
         T[2, 3] = table.height + 0.005 - float((obj.vertices @ T[2, :3]).min())
         scene.place(index, T)
         resting = False
@@ -388,18 +391,21 @@ def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator
 
 
 def _free_place(
-    scene: LiftScene, index: int, T: Float[np.ndarray, "4 4"], region: Region, draw: np.random.Generator
+    scene: LiftScene, index: int, T: Float[np.ndarray, "4 4"], region: Region, draw: np.random.Generator, apart: float,
 ) -> Float[np.ndarray, "2"]:
-    """Where an object in this orientation stands APART from those before it; the last place that was tried if there is none."""
+    """Where an object in this orientation stands so far apart [m] from those before it, or else the farthest place tried."""
     base, outline = scene.robot.T_world_base[:2, 3], scene.objects[index].cloud @ T[:2, :3].T
     poses = [scene.pose(i) for i in range(index)]
     others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
-    tree, place = KDTree(np.concatenate(others)) if others else None, base
+    tree, best = KDTree(np.concatenate(others)) if others else None, (-1.0, base)
     for _ in range(100):
         place = base + draw.uniform(region[:2], region[2:])
-        if tree is None or tree.query(outline + place)[0].min() > APART:
+        distance = np.inf if tree is None else float(tree.query(outline + place)[0].min())
+        if distance > best[0]:
+            best = distance, place
+        if distance > apart:
             break
-    return place
+    return best[1]
 
 
 def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, PalmOptions, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ class Plan:
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none."""
+    friction: Annotated[float, tyro.conf.arg(metavar="MU")] = 0.5
+    """Friction between hand, object and table, in simulated lifts."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
@@ -104,8 +106,8 @@ class Plan:
         scene = None if self.scene is None else load_scene(self.scene)
         constraints = self.constraints.constraints(obstacles=scene)
         config = PlanConfig(
-            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds,
-            least_confidence=self.least_confidence)
+            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, friction=self.friction,
+            planner_seconds=self.planner_seconds, least_confidence=self.least_confidence)
         for option, place in (("--at", self.at), ("--near", self.near)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
@@ -243,6 +245,7 @@ class Tabletop:
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
+    friction: Friction = 0.5
     region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
     """Two corners of the area where objects are put, from the arm's base [m]. A small arm needs a nearer one."""
     clutter: int = 0
@@ -279,8 +282,8 @@ class Tabletop:
             check_output(self.video, *FORMATS)
         config = TabletopConfig(
             self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
-            mass=self.mass, place=self.place, plan=PlanConfig(
-                self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
+            mass=self.mass, friction=self.friction, place=self.place, plan=PlanConfig(
+                self.num, friction=self.friction, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
