@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
 from dro_grasp.arm.clearing import ClearConfig, Cleared, Pick, clear_table
 from dro_grasp.arm.motion import Trajectory
 from dro_grasp.arm.physics import FRICTION, LiftScene, check_friction
 from dro_grasp.arm.robot import Robot, Table
-from dro_grasp.arm.tabletop import Region, TabletopConfig, Watcher, depth_image, scatter, thinned_intrinsics
+from dro_grasp.arm.table_setup import Region, scatter
+from dro_grasp.arm.tabletop import TabletopConfig, Watcher
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
+    from dro_grasp.arm.attempts import Attempt
     from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.arm.robot import Robot
     from dro_grasp.arm.table_scene import PickedObject
-    from dro_grasp.arm.tabletop import Attempt
 
 
 FLOATS = 0.1
@@ -274,7 +274,8 @@ class Tabletop:
         require_extra("arm")
         from dro_grasp.arm.animation import FORMATS, draw_attempt
         from dro_grasp.arm.planner import PlanConfig
-        from dro_grasp.arm.tabletop import TabletopConfig, TabletopRun, run_tabletop
+        from dro_grasp.arm.tabletop import TabletopConfig
+        from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
@@ -295,7 +296,7 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.arm.tabletop import endings, failures, lifted, placing_errors, processor_seconds
+        from dro_grasp.arm.attempts import endings, failures, lifted, placing_errors, processor_seconds
         from dro_grasp.compare.metrics import wilson_interval
 
         held = sum(a.success for a in done)
