@@ -16,7 +16,7 @@ from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.table_scene import pick_object, sort_out
+from dro_grasp.arm.table_scene import pick_object, seen_on_table
 from dro_grasp.arm.trajectory import find_path, smooth, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
@@ -24,6 +24,8 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.loading import mesh_object
+from dro_grasp.objects.perception.choosing import Spot
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
@@ -166,13 +168,14 @@ def clear_table(
                           "file: what is to be cleared has to be seen on one")
     picks, failed = list[Pick](), list[Pick]()
     while len(picks) < config.most:
-        points, places = _things(robot, rig, config.bin)
+        scene, places = _things(robot, rig, config.bin)
         left = sorted((place for place in places if len(_near(failed, place)) < config.tries),
                       key=lambda place: len(_near(failed, place)))  # the rest of the order is that of places
         if not left:
             return Cleared(tuple(picks), tuple(_near(failed, place)[-1] for place in places))
+        assert scene is not None  # where something is left
         for place in left:  # until something moves, and what was seen is no longer true
-            pick = _pick(robot, rig, points, place, predictor, config, seed + len(picks), judged)
+            pick = _pick(robot, rig, scene, place, predictor, config, seed + len(picks), judged)
             picks.append(pick)
             failed += [pick] if pick.reason else []
             if progress is not None:
@@ -182,33 +185,34 @@ def clear_table(
     return Cleared(tuple(picks), tuple(failed))
 
 
-def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Float[np.ndarray, "n 3"], list[tuple[float, float]]]:
-    """What the camera sees outside the bin, in its frame [m], and where things stand, those first that have most room."""
+def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Scene | None, list[Float[np.ndarray, "3"]]]:
+    """What the camera sees outside the bin, and a point of each thing in the world [m], those first that have most room."""
     assert robot.camera is not None
-    assert robot.table is not None
     T, points = robot.camera.T_world_camera, rig.look()
     points = points[~bin.holds(points @ T[:3, :3].T + T[:3, 3], BESIDE)]
     try:
-        places = sort_out(points, T, robot.table).places
+        scene = seen_on_table(load_scene(points, "thing", camera=robot.camera.as_seen()), robot)
     except ObjectError:
-        return points, []
+        return None, []
+    spots = [scene.spot(number) for number in range(scene.segments.count)]
+    places = np.array([spot[:2] for spot in spots]).reshape(-1, 2)
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
     order = (-apart.min(1, initial=np.inf)).argsort(kind="stable")
-    return points, [(float(x), float(y)) for x, y in places[order]]
+    return scene, [spots[k] for k in order]
 
 
-def _near(picks: Sequence[Pick], place: tuple[float, float]) -> list[Pick]:
+def _near(picks: Sequence[Pick], place: Spot) -> list[Pick]:
     return [pick for pick in picks if np.hypot(pick.place[0] - place[0], pick.place[1] - place[1]) < SAME]
 
 
 def _pick(
-    robot: Robot, rig: Rig, points: Float[np.ndarray, "n 3"], place: tuple[float, float], predictor: GraspPredictor,
+    robot: Robot, rig: Rig, scene: Scene, spot: Spot, predictor: GraspPredictor,
     config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None,
 ) -> Pick:
     """Pick the thing at a place and drop it into the bin; the arm is at home afterwards."""
-    assert robot.camera is not None
+    place = (float(spot[0]), float(spot[1]))
     try:
-        seen = pick_object("thing", points, robot, robot.camera.T_world_camera, near=place)
+        seen = pick_object(scene, robot, spot)
     except DroGraspError as error:
         return Pick(place, "see", str(error))
     assert seen.robot.table is not None
