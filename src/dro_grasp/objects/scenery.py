@@ -107,10 +107,14 @@ class Scene:
                               "one object out of it, or the object's own mesh")
         return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
 
+    def points_seen(self) -> Float[np.ndarray, "n 3"]:
+        """All points as they were seen, in the scene's frame [m], as `segments` label them."""
+        assert self.sight is not None
+        return self.sight.world()
+
     def spot(self, number: int) -> Float[np.ndarray, "3"]:
         """The point of a thing that is nearest to the middle of its points [m]."""
-        assert self.sight is not None
-        points = self.sight.world()[self.segments.labels == number]
+        points = self.points_seen()[self.segments.labels == number]
         return points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
 
     def chosen(
