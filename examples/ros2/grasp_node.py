@@ -3,7 +3,7 @@
     python grasp_node.py --ros-args -p robot:=my_robot.yaml -r points:=/camera/depth/points
 
     in   points     sensor_msgs/PointCloud2       in the frame of the robot file's camera: table and what stands on it
-    in   grasp_at   geometry_msgs/PointStamped    near the object that is wanted, in the robot's world; it starts the work
+    in   grasp_at   geometry_msgs/PointStamped    on the object that is wanted, in the robot's world; it starts the work
     out  arm, hand  trajectory_msgs/JointTrajectory    with the same times, in the numbers that the drivers take
     out  squeeze    sensor_msgs/JointState        targets of the hand while it holds, and their efforts
     out  held, empty  sensor_msgs/JointState      where its joints are then, with the object in the hand and without
@@ -27,10 +27,12 @@ KINDS = {"arm": "trajectory_msgs/JointTrajectory", "hand": "trajectory_msgs/Join
          "empty": "sensor_msgs/JointState", "grasps": "geometry_msgs/PoseArray"}
 
 
-def planned(robot: dro.Robot, predictor: dro.GraspPredictor, points: np.ndarray, near: tuple[float, float]) -> dict[str, Any]:
-    """Messages by topic, as plain values, for the object near a place of the table."""
+def planned(
+    robot: dro.Robot, predictor: dro.GraspPredictor, points: np.ndarray, at: tuple[float, float, float]
+) -> dict[str, Any]:
+    """Messages by topic, as plain values, for the object at a place of the world [m]."""
     assert robot.camera is not None
-    picked = dro.pick_object("seen", points, robot, robot.camera.T_world_camera, near=near)
+    picked = dro.pick_object(dro.load_scene(points, camera=robot.camera.as_seen()), robot, at, name="seen")
     plan = dro.plan(picked.robot, picked.obj, obstacles=picked.obstacles, predictor=predictor)
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": plan.notes.frame}
     best = np.argsort(-plan.scene.score, kind="stable")
@@ -78,7 +80,7 @@ def main() -> None:
                 return
             points = read_points_numpy(self.cloud, ("x", "y", "z")).astype(np.float64)
             try:
-                messages = planned(self.robot, self.predictor, points, (place.point.x, place.point.y))
+                messages = planned(self.robot, self.predictor, points, (place.point.x, place.point.y, place.point.z))
             except dro.DroGraspError as error:
                 self.get_logger().error(str(error))
                 return

@@ -18,12 +18,14 @@ from dro_grasp.arm.animation import Recorder, draw_animation
 from dro_grasp.arm.camera_view import STRIDE, depth_image, thinned_intrinsics
 from dro_grasp.arm.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planner import PlanConfig
-from dro_grasp.arm.table_scene import sort_out
+from dro_grasp.arm.table_scene import PickedObject, pick_object
 from dro_grasp.arm.table_setup import APART, other_objects, rest, scatter
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
 from dro_grasp.objects.perception.scan import depth_points
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import solid_of
 
 QUICK = TabletopConfig(
@@ -61,14 +63,23 @@ def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.R
     assert (depth[seen] <= expected[seen] + 1e-6).all()
 
 
+def _picked(depth: np.ndarray, robot: dro.Robot) -> tuple[PickedObject, np.ndarray]:
+    """The only thing of a depth image, and its points in the camera's frame [m]."""
+    assert robot.camera is not None
+    view = load_scene(depth, camera=SceneCamera(robot.camera.T_world_camera, thinned_intrinsics(robot.camera)))
+    assert view.sight is not None
+    return pick_object(view, robot), view.sight.points[view.chosen().own]
+
+
 def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: LiftScene, robot: dro.Robot) -> None:
     assert robot.camera is not None
     assert robot.table is not None
     (depth, mask), T = depth_image(scene, robot.camera, 0.0015, 1), robot.camera.T_world_camera
-    sight = sort_out(depth_points(depth, thinned_intrinsics(robot.camera)), T, robot.table)
-    assert len(sight.points) == pytest.approx(int(mask.sum()), rel=0.1)
-    assert abs(sight.table_height) < 1e-3
-    in_object = (sight.points @ T[:3, :3].T + T[:3, 3] - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
+    seen, points = _picked(depth, robot)
+    assert len(points) == pytest.approx(int(mask.sum()), rel=0.1)
+    assert seen.robot.table is not None
+    assert abs(seen.robot.table.height) < 1e-3
+    in_object = (points @ T[:3, :3].T + T[:3, 3] - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
     distance = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs()
     assert float(distance.median()) < 0.0015
     assert float(distance.quantile(0.95)) < 0.005
@@ -91,9 +102,10 @@ def test_the_table_has_the_noise_of_a_kind_of_camera(scene: LiftScene, robot: dr
         error.append(((depth - true) / PRESETS[name].deviation(np.maximum(true, 0.1), np.arccos(cosine)))[near])
     assert np.concatenate(error).std() == pytest.approx(1.0, abs=0.1)
     assert (there[table] > 0).mean() > 0.9
-    sight = sort_out(depth_points(depth, thinned_intrinsics(camera)), T, robot.table)
-    assert abs(sight.table_height) < 1e-3
-    assert len(sight.points) == pytest.approx(int(mask.sum()), rel=0.25)
+    seen, points = _picked(depth, robot)
+    assert seen.robot.table is not None
+    assert abs(seen.robot.table.height) < 1e-3
+    assert len(points) == pytest.approx(int(mask.sum()), rel=0.25)
 
 
 def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: LiftScene, robot: dro.Robot) -> None:

@@ -93,18 +93,18 @@ def node(monkeypatch: pytest.MonkeyPatch, robot: dro.Robot, planned: MotionPlan)
 
 
 def at(x: float, y: float) -> Any:
-    return SimpleNamespace(point=SimpleNamespace(x=x, y=y, z=0.0))
+    return SimpleNamespace(point=SimpleNamespace(x=x, y=y, z=0.05))
 
 
 def test_a_place_in_a_cloud_becomes_messages(
     node: Node, planned: MotionPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    monkeypatch.setattr(dro, "pick_object", lambda *given, near: asked.append(near) or SimpleNamespace(
+    monkeypatch.setattr(dro, "pick_object", lambda scene, robot, at, name: asked.append(at) or SimpleNamespace(
         robot=None, obj=None, obstacles=[]))
-    node.calls["points"](np.zeros((4, 3), np.float32))
+    node.calls["points"](np.ones((4, 3), np.float32))
     node.calls["grasp_at"](at(0.5, 0.1))
-    assert (asked, node.errors) == ([(0.5, 0.1)], [])
+    assert (asked, node.errors) == ([(0.5, 0.1, 0.05)], [])
     assert {topic: message.kind for topic, message in node.sent.items()} == {
         "arm": "JointTrajectory", "hand": "JointTrajectory", "squeeze": "JointState", "held": "JointState",
         "empty": "JointState", "grasps": "PoseArray"}
@@ -125,5 +125,5 @@ def test_what_goes_wrong_is_logged_and_the_node_goes_on(node: Node) -> None:
     node.calls["grasp_at"](at(0.5, 0.1))
     assert node.errors[0] == "no cloud has come yet on topic 'points'"
     assert len(node.errors) == 2
-    assert "table" in node.errors[1]
+    assert "no point" in node.errors[1]
     assert node.sent == {}

@@ -58,7 +58,6 @@ def test_where_it_is_not_clear_which_is_meant_the_picture_is_drawn_all_the_same(
 @pytest.mark.parametrize(("more", "told"), [
     (["--at", "0", "0", "0", "--nearest"], "--at and --nearest each say which thing"),
     (["--object", "mug"], "both are given"),
-    (["--obstacles", "x.ply"], "leave out --obstacles"),
 ])
 def test_what_contradicts_a_scene_is_refused(common: list[str], more: list[str], told: str, capsys) -> None:
     assert main([*common, *more]) == 2

@@ -212,6 +212,11 @@ def test_a_scene_has_the_distances_of_its_boxes() -> None:
     inside = mesh.distances(torch.from_numpy(WALL_CENTRE[None]).float())[0]
     assert float(inside) == pytest.approx(-0.01, abs=0.002)
     assert load_scene(DOTS).near(np.full(3, 1.0), np.full(3, 1.2)) is None, "nothing of it is there"
+    both = load_scene(SCENE).joined(load_scene(DOTS)).near(low, high)
+    assert both is not None
+    places = torch.from_numpy(np.random.default_rng(0).uniform(low, high, (200, 3))).float()
+    apart = torch.stack([field.distances(places)[0] for field in (mesh, cloud)]).min(0).values
+    assert (both.distances(places)[0] - apart).abs().max() < 0.004  # the grids differ
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])

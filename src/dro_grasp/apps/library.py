@@ -93,8 +93,7 @@ class Library:
             return {}
         names: dict[str, str] = {}
         for k in range(scene.segments.count):
-            points = scene.sight.world()[scene.segments.labels == k]
-            found = scene.object_at(points[len(points) // 2], name=f"thing {k + 1} of {name}")
+            found = scene.object_at(scene.spot(k), name=f"thing {k + 1} of {name}")
             names[found.obj.name] = rest = f"all but {found.obj.name}"
             self.add("object", found.obj.name, found.obj)
             if found.obstacles is not None:

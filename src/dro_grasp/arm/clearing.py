@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,7 +16,7 @@ from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.table_scene import pick_object, sort_out
+from dro_grasp.arm.table_scene import pick_object, seen_on_table
 from dro_grasp.arm.trajectory import find_path, smooth, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
@@ -24,6 +24,7 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.loading import mesh_object
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
@@ -166,13 +167,14 @@ def clear_table(
                           "file: what is to be cleared has to be seen on one")
     picks, failed = list[Pick](), list[Pick]()
     while len(picks) < config.most:
-        points, places = _things(robot, rig, config.bin)
-        left = sorted((place for place in places if len(_near(failed, place)) < config.tries),
-                      key=lambda place: len(_near(failed, place)))  # the rest of the order is that of places
+        scene, things = _things(robot, rig, config.bin)
+        left = sorted((thing for thing in things if len(_near(failed, thing.place)) < config.tries),
+                      key=lambda thing: len(_near(failed, thing.place)))  # the rest of the order is that of things
         if not left:
-            return Cleared(tuple(picks), tuple(_near(failed, place)[-1] for place in places))
-        for place in left:  # until something moves, and what was seen is no longer true
-            pick = _pick(robot, rig, points, place, predictor, config, seed + len(picks), judged)
+            return Cleared(tuple(picks), tuple(_near(failed, thing.place)[-1] for thing in things))
+        assert scene is not None  # where something is left
+        for thing in left:  # until something moves, and what was seen is no longer true
+            pick = _pick(robot, rig, scene, thing, predictor, config, seed + len(picks), judged)
             picks.append(pick)
             failed += [pick] if pick.reason else []
             if progress is not None:
@@ -182,19 +184,27 @@ def clear_table(
     return Cleared(tuple(picks), tuple(failed))
 
 
-def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Float[np.ndarray, "n 3"], list[tuple[float, float]]]:
-    """What the camera sees outside the bin, in its frame [m], and where things stand, those first that have most room."""
+class _Thing(NamedTuple):
+    """What stands on the table."""
+
+    place: tuple[float, float]  # the middle of what was seen of it [m]
+    spot: Float[np.ndarray, "3"]  # a point of it [m]
+
+
+def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Scene | None, list[_Thing]]:
+    """What the camera sees outside the bin, and the things there, those first that have most room."""
     assert robot.camera is not None
-    assert robot.table is not None
     T, points = robot.camera.T_world_camera, rig.look()
     points = points[~bin.holds(points @ T[:3, :3].T + T[:3, 3], BESIDE)]
     try:
-        places = sort_out(points, T, robot.table).places
+        scene = seen_on_table(load_scene(points, "thing", camera=robot.camera.as_seen()), robot)
     except ObjectError:
-        return points, []
+        return None, []
+    world, labels = scene.points_seen(), scene.segments.labels
+    places = np.array([world[labels == k, :2].mean(0) for k in range(scene.segments.count)]).reshape(-1, 2)
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
     order = (-apart.min(1, initial=np.inf)).argsort(kind="stable")
-    return points, [(float(x), float(y)) for x, y in places[order]]
+    return scene, [_Thing((float(places[k, 0]), float(places[k, 1])), scene.spot(int(k))) for k in order]
 
 
 def _near(picks: Sequence[Pick], place: tuple[float, float]) -> list[Pick]:
@@ -202,13 +212,13 @@ def _near(picks: Sequence[Pick], place: tuple[float, float]) -> list[Pick]:
 
 
 def _pick(
-    robot: Robot, rig: Rig, points: Float[np.ndarray, "n 3"], place: tuple[float, float], predictor: GraspPredictor,
+    robot: Robot, rig: Rig, scene: Scene, thing: _Thing, predictor: GraspPredictor,
     config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None,
 ) -> Pick:
     """Pick the thing at a place and drop it into the bin; the arm is at home afterwards."""
-    assert robot.camera is not None
+    place = thing.place
     try:
-        seen = pick_object("thing", points, robot, robot.camera.T_world_camera, near=place)
+        seen = pick_object(scene, robot, thing.spot)
     except DroGraspError as error:
         return Pick(place, "see", str(error))
     assert seen.robot.table is not None

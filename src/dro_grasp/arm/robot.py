@@ -31,6 +31,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import flat
+from dro_grasp.objects.perception.scene_files import SceneCamera
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
 HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
@@ -49,6 +50,10 @@ class CameraMount:
     intrinsics: Float[np.ndarray, "3 3"]  # Focal lengths and principal point [pixels]
     width: int = 640  # [pixels]
     height: int = 480  # [pixels]
+
+    def as_seen(self) -> SceneCamera:
+        """The camera for `load_scene`."""
+        return SceneCamera(self.T_world_camera, self.intrinsics, "world")
 
 
 @dataclass(frozen=True)

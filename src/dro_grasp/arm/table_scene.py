@@ -1,41 +1,23 @@
-"""Objects on a table, told apart in the points of a depth camera: the table's plane by a fit, the rest by distance."""
+"""Objects on a robot's table: one of what its camera saw is picked, the table is where it was seen, all else is avoided."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+from jaxtyping import Float
 
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import VOXEL
 from dro_grasp.errors import ObjectError, RobotError
-from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
-from dro_grasp.objects.perception.scan import given_points, given_pose, scanned_object
-from dro_grasp.objects.reading import numbers, returned
+from dro_grasp.objects.perception.choosing import Pixel, Spot
+from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
-THICKNESS = 0.006  # Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)
-NEIGHBOUR = 0.012
-"""Points nearer to each other than this are of one object [m] (ours): a camera a metre away has points each 3 mm."""
-FEWEST = 60  # Fewest points of an object (ours)
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What a camera sees on a table."""
-
-    points: Float[np.ndarray, "n 3"]  # Points of the object that is wanted, in the frame in which they were given [m]
-    others: Float[np.ndarray, "m 3"]  # Points of other things on the table, in the world [m]
-    table_height: float  # Height of the fitted plane in the middle of the table [m]
-    places: Float[np.ndarray, "k 2"]
-    """Where things stand on the table, the one with most points first: x and y in the world [m]."""
+LEVEL = 0.98  # Least cosine between a table's normal and the vertical [1] (ours): 11 degrees
 
 
 @dataclass(frozen=True)
@@ -52,124 +34,92 @@ class PickedObject:
 
 @checked
 def pick_object(
-    name: str, points: ArrayLike, robot: Robot, T_world_camera: ArrayLike | None = None,
-    near: tuple[float, float] | None = None, mask: ArrayLike | None = None,
+    scene: Scene, robot: Robot, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
+    nearest: bool = False, name: str | None = None,
 ) -> PickedObject:
-    """Find the table in a cloud, remove it, and pick one of the objects on it.
-
-    Objects are told apart by distance: two that are less than 12 mm apart count as one, unless a mask is given.
+    """One object of what was seen of a robot's table; see `Scene.object_at`, which says how one is chosen.
 
     Examples:
-        >>> picked = pick_object("mug", points, robot, robot.camera.T_world_camera, near=(0.5, 0.1))
+        >>> scene = load_scene(depth, camera=robot.camera.as_seen())
+        >>> picked = pick_object(scene, robot, (0.5, 0.1, 0.05))
         >>> made = plan(picked.robot, picked.obj, obstacles=picked.obstacles)
 
     Args:
-        name: What to call it.
-        points: In the camera's frame, or in the world's, (n, 3) [m]; several objects, and the table. NaN are left out.
+        scene: What was seen, in the world's frame. What is beside the table is left out.
         robot: With a table.
-        T_world_camera: The camera's pose [m], if the points are in its frame: the unseen side is then estimated.
-        near: A place in the world near the object that is wanted [m]; needed where there are several.
-        mask: Which points belong to the object that is wanted, (n,): those where it is true or not 0.
+        at: A place on the object or near it, in the world: x, y, z [m].
+        pixel: A pixel that shows it: column and row, from the upper left.
+        mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG.
+        nearest: Take what is nearest to the camera.
+        name: What to call it; the scene's name by default.
 
     Raises:
-        ObjectError: No level plane, nothing on it, or nothing within the mask; or it is not clear which object is wanted.
-        OptionError: The pose is no rigid motion.
+        ObjectError: No level plane, nothing on it, or it is not clear which object is meant.
+        OptionError: Two choices are given, or the scene lacks what one of them needs.
         RobotError: The robot has no table.
     """
+    return as_picked(seen_on_table(scene, robot).object_at(at, pixel=pixel, mask=mask, nearest=nearest, name=name), robot)
+
+
+def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
+    """An object that was found on a robot's table; see `pick_object`."""
+    level = at_seen_height(robot, found.obj)
+    assert level.table is not None
+    others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
+    return PickedObject(found.obj, _solid(others, level.table.height), level)
+
+
+def seen_on_table(scene: Scene, robot: Robot) -> Scene:
+    """What of a scene in the world is over or under the rectangle of the table.
+
+    Raises:
+        ObjectError: Nothing is.
+        RobotError: The robot has no table.
+    """
+    table = _table(robot, scene.name)
+    if scene.sight is None:
+        return scene  # which says of itself that it is a mesh
+    kept = np.asarray((np.abs(scene.sight.world()[:, :2] - table.centre) < np.array(table.size) / 2).all(1))
+    if not kept.any():
+        raise ObjectError(f"'{scene.name}' shows nothing of the table at {table.centre} m; correct the camera's pose in the "
+                          "robot file, or the table's place")
+    return scene if kept.all() else scene.of(kept)
+
+
+def at_seen_height(robot: Robot, obj: ObjectModel) -> Robot:
+    """The robot with its table at the height of the plane on which an object in the world stands.
+
+    Raises:
+        ObjectError: There is no such plane, or it is not level.
+        RobotError: The robot has no table.
+    """
+    table, plane = _table(robot, obj.name), obj.table
+    if plane is None or plane[2] < LEVEL:
+        tilt = "" if plane is None else f": the plane is tilted by {np.degrees(np.arccos(plane[2])):.0f} degrees"
+        raise ObjectError(f"the camera sees no level table below '{obj.name}'{tilt}; correct its pose in the robot file, or "
+                          "the table's place")
+    height = float((plane[3] - plane[:2] @ np.array(table.centre)) / plane[2])
+    return replace(robot, table=replace(table, height=height))
+
+
+def _table(robot: Robot, name: str) -> Table:
     if robot.table is None:
         raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
                          "object's points alone")
-    given, T = given_points(points, name)[:, :3], None if T_world_camera is None else given_pose(T_world_camera)
-    wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
-    if wanted is not None and wanted.shape != (len(given),):
-        raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")
-    finite = returned(given)
-    sight = sort_out(
-        given[finite], np.eye(4) if T is None else T, robot.table, near, None if wanted is None else wanted[finite])
-    if len(sight.places) > 1 and near is None and mask is None:
-        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in sight.places)
-        raise ObjectError(f"'{name}' has {len(sight.places)} things that stand on the table, at {places} m; say which one is "
-                          "wanted by a place near it (near=(X, Y)), or give its points alone")
-    height = sight.table_height
-    level = replace(robot, table=replace(robot.table, height=height))
-    if T is None:
-        return PickedObject(cloud_object(name, sight.points, origin=name, keep_table=True), _solid(sight), level)
-    whole = scanned_object(name, sight.points, T, keep_table=True)
-    rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[whole.cloud[:, 2] > height]
-    return PickedObject(
-        replace(cloud_object(name, rows, origin=name, keep_table=True, seen=whole.seen), notes=whole.notes),
-        _solid(sight), level)
+    return robot.table
 
 
-def sees_table(world: Float[np.ndarray, "n 3"], table: Table) -> bool:
-    """Whether points are those of a table, with or without something on it, and not of one object alone."""
-    # A fifth of them lies within 3 cm of the table's height in the robot file, and is longer than any object (ours).
-    on = world[np.abs(world[:, 2] - table.height) < 0.03]
-    return len(on) >= 0.2 * len(world) and float(np.ptp(on[:, :2], axis=0).max(initial=0)) > 0.4
-
-
-def _solid(sight: Sight) -> list[ObjectModel]:
-    if not len(sight.others):
+def _solid(points: Float[np.ndarray, "n 3"], table: float) -> list[ObjectModel]:
+    """What stands above a table of this height [m], solid down to it, as one thing; nothing for no points."""
+    points = points[points[:, 2] > table]
+    if not len(points):
         return []
-    cells, column = np.unique(np.floor(sight.others[:, :2] / VOXEL).astype(int), axis=0, return_inverse=True)
+    cells, column = np.unique(np.floor(points[:, :2] / VOXEL).astype(int), axis=0, return_inverse=True)
     tops = np.full(len(cells), -np.inf)
-    np.maximum.at(tops, column.ravel(), sight.others[:, 2])
-    heights = [np.arange(top, min(sight.table_height, top - VOXEL), -VOXEL) for top in tops]
+    np.maximum.at(tops, column.ravel(), points[:, 2])
+    heights = [np.arange(top, min(table, top - VOXEL), -VOXEL) for top in tops]
     rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z]) for cell, z in zip(cells, heights, strict=True)]
-    points = np.concatenate(rows)
-    if len(points) < MIN_CLOUD:  # an obstacle all the same, in the same cells
-        points = (points[:, None] + VOXEL / 3 * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)).reshape(-1, 3)
-    return [cloud_object("other things", points, origin="other things", keep_table=True)]
-
-
-def sort_out(
-    points: Float[np.ndarray, "n 3"], T_world_camera: Float[np.ndarray, "4 4"], table: Table,
-    near: tuple[float, float] | None = None, mask: Bool[np.ndarray, " n"] | None = None,
-) -> Sight:
-    """Points of a table sorted: those of one object, and those of others. Arguments as for `pick_object`.
-
-    Without `near` and `mask`, the thing with most points is taken.
-
-    Raises:
-        ObjectError: There is no level plane, nothing stands on it, or the mask has nothing of it.
-    """
-    world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    inside = (np.abs(world[:, :2] - table.centre) < np.array(table.size) / 2).all(1)
-    plane = fit_plane(world[inside])
-    height = world @ plane[:3] - plane[3]
-    kept = inside & (height > THICKNESS) & (height < 0.4)  # [m]: what is higher is no object's (ours)
-    middle = (plane[3] - plane[:2] @ np.array(table.centre)) / plane[2]
-    points, world, group = points[kept], world[kept], clusters(world[kept])
-    sizes = np.bincount(group) if len(group) else np.zeros(1, int)
-    if sizes.max() < FEWEST:
-        raise ObjectError(f"nothing stands on the table: {int(sizes.max())} points are left after its plane is removed; put "
-                          "the object into the camera's view, or correct the camera's pose in the robot file")
-    large = [int(g) for g in (-sizes).argsort(kind="stable") if sizes[g] >= FEWEST]
-    places = np.stack([world[group == g, :2].mean(0) for g in large])
-    if mask is not None:
-        wanted = mask[kept]
-        if wanted.sum() < FEWEST:
-            raise ObjectError(f"the mask has {int(wanted.sum())} points above the table, and at least {FEWEST} are needed; "
-                              "give one that is true on the object")
-    else:
-        nearest = 0 if near is None else int(np.linalg.norm(places - near, axis=1).argmin())
-        wanted = group == large[nearest]
-    # Small groups within 5 cm of the wanted one are taken for parts of it, and groups of less than 5 points for noise (ours).
-    fragment = (sizes[group] < FEWEST) & (KDTree(world[wanted]).query(world)[0] < 0.05)
-    others = ~wanted & ~fragment & (sizes[group] >= 5)
-    return Sight(points[wanted], world[others], float(middle), places)
-
-
-def fit_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
-    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m]."""
-    plane = largest_plane(points, THICKNESS / 2, 0.2, fits=3)
-    if plane is None or (np.abs(points @ plane[:3] - plane[3]) < THICKNESS / 2).sum() < FEWEST:
-        raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")
-    return plane
-
-
-def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Number of the connected group of each point; neighbours are closer than NEIGHBOUR."""
-    pairs = KDTree(points).query_pairs(NEIGHBOUR, output_type="ndarray") if len(points) else np.zeros((0, 2), int)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    return connected_components(graph, directed=False)[1] if len(points) else np.zeros(0, int)
+    solid = np.concatenate(rows)
+    if len(solid) < MIN_CLOUD:  # an obstacle all the same, in the same cells
+        solid = (solid[:, None] + VOXEL / 3 * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)).reshape(-1, 3)
+    return [cloud_object("other things", solid, origin="other things", keep_table=True)]

@@ -30,7 +30,7 @@ from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName, depth_noise
-from dro_grasp.objects.perception.scan import depth_points
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
@@ -240,10 +240,11 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     camera = robot.camera
     assert camera is not None
     depth, mask = depth_image(scene, camera, config.noise, seed)
-    x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
-    points = depth_points(depth, thinned_intrinsics(camera))
-    known = mask[depth > 0] if config.segment == "mask" else None
-    seen = pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
+    view = load_scene(depth, obj.name, camera=replace(camera, intrinsics=thinned_intrinsics(camera)).as_seen())
+    if config.segment == "mask":
+        seen = pick_object(view, robot, mask=mask)
+    else:
+        seen = pick_object(view, robot, T[:3, :3] @ obj.cloud.mean(0) + T[:3, 3])
     return seen if config.mass is None else replace(seen, obj=with_mass(seen.obj, config.mass)), np.eye(4)
 
 

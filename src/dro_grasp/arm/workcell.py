@@ -412,7 +412,11 @@ def _free_pose(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "7"]:
 
 
 def scene_solid(scene: Scene, centre: Float[np.ndarray, "3"], reach: float) -> list[ObjectModel]:
-    """What of a scene in the world is within `reach` [m] of the robot's base, as one thing; nothing if none of it is."""
+    """What of a scene in the world is within `reach` [m] of the robot's base, each part as one thing; nothing if none is."""
+    return [solid for part in scene.parts for solid in _solid(part, centre, reach)]
+
+
+def _solid(scene: Scene, centre: Float[np.ndarray, "3"], reach: float) -> list[ObjectModel]:
     points = scene.points
     if scene.faces is not None:
         mesh = trimesh.Trimesh(scene.points, scene.faces, process=False)

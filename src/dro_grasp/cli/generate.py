@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
+from dro_grasp.cli.given_scene import check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.cli.remote import generate_at, server_of
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from dro_grasp.predict.predictor import GraspPredictor, Prediction
     from dro_grasp.predict.problem import GraspProblem
 
-CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
 TOGETHER = 64  # Objects of a folder that a GPU predicts together (ours): their distances fill some gigabytes
 
 
@@ -66,7 +66,8 @@ class Generate:
     """Whether fingertips may touch the table."""
     obstacles: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around the object, without the object itself, in the same frame and unit. The hand stays
-    clear of it: open and 10 cm back, on the straight way from there in pregrasp, in grasp and in squeeze."""
+    clear of it, as of all else in --scene: open and 10 cm back, on the straight way from there in pregrasp, in grasp and in
+    squeeze."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}. The object is then a cloud in the camera's frame, which is cleaned.
     Grasps, --direction and --table are in the named frame. For depth images, with "intrinsics": 3x3."""
@@ -154,11 +155,12 @@ class Generate:
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         found = None
         if self.scene is not None:
-            found = self._find()
+            found = find_thing(load_scene(self.scene, scale=self.scale, camera=self.camera), self)
             constraints = replace(constraints, obstacles=found.obstacles)
         if self.obstacles is not None:
             scene = load_scene(self.obstacles, scale=self.scale)
-            constraints = replace(constraints, obstacles=scene if camera is None else scene.moved(camera.T.double().numpy()))
+            scene = scene if camera is None else scene.moved(camera.T.double().numpy())
+            constraints = replace(constraints, obstacles=scene.joined(constraints.obstacles))
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
@@ -171,44 +173,7 @@ class Generate:
 
     def check_scene(self) -> None:
         """Refuse options that contradict one another, by an OptionError."""
-        from dro_grasp.errors import OptionError
-        from dro_grasp.files import check_output
-
-        if (self.object is None) == (self.scene is None):
-            raise OptionError("give --object NAME|PATH, or --scene CLOUD|DEPTH with the thing that is meant "
-                              f"({', '.join(CHOICES)}); {'neither is' if self.object is None else 'both are'} given")
-        given = [option for option, value in zip(CHOICES, (self.at, self.pixel, self.mask, self.nearest or None), strict=True)
-                 if value is not None]
-        if self.scene is None and (given or self.scene_picture is not None):
-            raise OptionError(f"{' and '.join([*given, *['--scene-picture'] * (self.scene_picture is not None)])} concern a "
-                              "scene; give it by --scene instead of --object")
-        if len(given) > 1:
-            raise OptionError(f"{' and '.join(given)} each say which thing of the scene is meant; give one of them")
-        if self.scene is not None and self.obstacles is not None:
-            raise OptionError("--obstacles and --scene are given, and all else in the scene counts as obstacles; leave out "
-                              "--obstacles")
-        if self.scene_picture is not None:
-            check_output(self.scene_picture, ".png")
-
-    def _find(self) -> FoundObject:
-        """The one thing of the scene that is meant; the picture is drawn even where none is."""
-        from dro_grasp.errors import ObjectError
-        from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.pictures.scene import draw_scene
-
-        assert self.scene is not None
-        scene = load_scene(self.scene, scale=self.scale, camera=self.camera)
-        try:
-            found = scene.object_at(self.at, pixel=self.pixel, mask=self.mask, nearest=self.nearest)
-        except ObjectError:
-            if self.scene_picture is not None:
-                draw_scene(scene, None, self.scene_picture)
-                say_aside(f"what the scene shows: {self.scene_picture}")
-            raise
-        if self.scene_picture is not None:
-            draw_scene(scene, found, self.scene_picture)
-            say_aside(f"what was taken for the object: {self.scene_picture}")
-        return found
+        check_choice(self)
 
     def _parts(self, jobs: list[Any]) -> list[list[Any]]:
         """Objects that are predicted together: one by one on the CPU."""

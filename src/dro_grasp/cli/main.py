@@ -72,7 +72,7 @@ TRAINING: dict[str, str | None] = {"--size": "--preset"} | dict.fromkeys((
 FORMER_OPTIONS: dict[str, Mapping[str, str | None]] = {
     "generate": CONSTRAINTS | {"--method": "--source"},
     # --obstacles are things of an object's size there
-    "plan": CONSTRAINTS | {"--avoid": "--scene"},
+    "plan": CONSTRAINTS | {"--avoid": "--surroundings"},
     "tabletop": {option: CONSTRAINTS[option] for option in ("--cone", "--opening")},
     "onboard": {"--method": "--source"}, "benchmark": {"--looks": "--views"}, "train": TRAINING, "pretrain": TRAINING,
 }

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from dro_grasp.cli.given_scene import check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.arm.robot import Robot
     from dro_grasp.arm.table_scene import PickedObject
+    from dro_grasp.objects.perception.scene_files import SceneCamera
 
 
 FLOATS = 0.1
@@ -36,21 +38,29 @@ class Plan:
     """
 
     robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
-    object: str
-    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may
-    also show the table and other things."""
+    object: Annotated[str | None, optional("NAME|PATH", "none, with --scene")] = None
+    """An object's name (see `dro-grasp objects`), a mesh, or a cloud (PLY, NPY, PCD), in the robot's world frame. A cloud may
+    also show the table."""
+    scene: Annotated[Path | None, optional("CLOUD|DEPTH", "an object alone")] = None
+    """Instead of --object: what a camera saw, a cloud or a depth image (PNG, TIFF, NPY). One thing in it is the object, the
+    plane on which it stands the table, and nothing touches all else that is over the table."""
     camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
-    """File with {"frame": "world", "T_frame_camera": 4x4}, or `robot` for the camera of the robot file. The object is then a
-    cloud in the camera's frame, which is cleaned and completed."""
+    """File with {"frame": "world", "T_frame_camera": 4x4}, or `robot` for the camera of the robot file. Object or scene are
+    then in the camera's frame, and the unseen side is completed. For depth images, with "intrinsics": 3x3."""
     pose: Annotated[Path | None, optional("JSON", "the object's frame is the world frame")] = None
     """File with {"frame": "world", "T_frame_object": 4x4}: where the object stands."""
-    at: Annotated[tuple[float, float] | None, optional("X Y", "as --pose says")] = None
-    """Put the object on the table at this place [m], upright as in its own frame."""
-    near: Annotated[tuple[float, float] | None, optional("X Y", "there is only one")] = None
-    """Place in the world [m]. The object is then the nearest thing in a cloud of a table with several, and the motion keeps
-    clear of the others."""
+    at: Annotated[tuple[float, ...] | None, optional("X Y [Z]", "as --pose says, or the only thing")] = None
+    """X Y: put the object on the table at this place [m], upright as in its own frame. X Y Z: which thing of the scene, the one
+    at this place in the world [m]."""
+    pixel: Annotated[tuple[float, float] | None, optional("U V", "the only thing")] = None
+    """Which thing of the scene: the one that this pixel shows, by column and row."""
+    mask: Annotated[Path | None, optional("PNG", "the only thing")] = None
+    """Which thing of the scene: the pixels that are not black in this image."""
+    nearest: Flag = False  # Which thing of the scene: the one nearest to the camera.
+    scene_picture: Annotated[Path | None, optional("PNG", "no picture")] = None
+    """Picture of what was taken for the object, for tables and walls, and for obstacles, before anything is grasped."""
     obstacles: tuple[str, ...] = ()  # Clouds and meshes of things, in the world frame, that nothing may touch.
-    scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
+    surroundings: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
     of it."""
     start: Annotated[tuple[float, ...] | None, optional("Q ...", "the robot's home")] = None
@@ -103,14 +113,12 @@ class Plan:
         require_extra("arm")
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
-        scene = None if self.scene is None else load_scene(self.scene)
-        constraints = self.constraints.constraints(obstacles=scene)
+        self.check_scene()
+        constraints = self.constraints.constraints(
+            obstacles=None if self.surroundings is None else load_scene(self.surroundings))
         config = PlanConfig(
             self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, friction=self.friction,
             planner_seconds=self.planner_seconds, least_confidence=self.least_confidence)
-        for option, place in (("--at", self.at), ("--near", self.near)):
-            if place is not None and not all(map(math.isfinite, place)):
-                raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
         for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv"), (self.stages, ".yaml")):
             if path is not None:
                 check_output(path, ending)
@@ -165,62 +173,67 @@ class Plan:
                     temporary.write_text(text(), encoding="utf-8")
         return {what: str(path) for what, path, *_ in (("plan", self.output), *texts) if path}
 
+    def check_scene(self) -> None:
+        """Refuse options that contradict one another, by an OptionError."""
+        from dro_grasp.errors import OptionError
+
+        check_choice(self, own=("--at",))
+        if self.at is not None:
+            wanted, such = (("x and y", "0.5 0.1"), ("x, y and z", "0.5 0.1 0.05"))[self.scene is not None]
+            if len(self.at) != 2 + (self.scene is not None) or not all(map(math.isfinite, self.at)):
+                raise OptionError(f"--at is {' '.join(f'{value:g}' for value in self.at)}; give {wanted} in metres, such as "
+                                  f"--at {such}, of {'the scene' if self.scene is not None else 'the object'}")
+        if self.scene is not None and self.pose is not None:
+            raise OptionError("--pose says where an object stands that is given alone; leave it out: a scene is in the world's "
+                              "or a camera's frame")
+        if self.scene is None and sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
+            raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
+
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
         """The object with what stands around it, and where its frame is in the world."""
         import numpy as np
 
         from dro_grasp.arm.robot import Table
-        from dro_grasp.arm.table_scene import PickedObject, pick_object, sees_table
-        from dro_grasp.errors import OptionError
+        from dro_grasp.arm.table_scene import PickedObject, as_picked, at_seen_height, seen_on_table
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
-        from dro_grasp.geometry.table_plane import table_plane
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.loading import read_geometry
         from dro_grasp.objects.perception.scan import load_scan
-        from dro_grasp.objects.reading import coordinates, read_points, returned
+        from dro_grasp.objects.scenery import load_scene
 
-        if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
-            raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
-        if self.near is not None and (self.pose is not None or self.at is not None):
-            raise OptionError("--near picks an object of a cloud in the world's or a camera's frame; leave out --pose and --at")
-        T, path, camera = np.eye(4), given_path(self.object), self._camera(robot)
-        if camera is not None or self.near is not None:
-            points = read_points(path)
-            world = points if camera is None else points @ camera[:3, :3].T + camera[:3, 3]
-            if self.near is not None or (robot.table is not None and sees_table(world, robot.table)):
-                return pick_object(path.stem, points, robot, camera, self.near), T
-            assert camera is not None
-            return PickedObject(load_scan(path, camera), [], robot), T
-        if self.pose is None and self.at is None and robot.table is not None and path.is_file():
-            found, unit = read_geometry(path)  # a table is larger than any object that is loaded
-            if isinstance(found, np.ndarray):
-                found = coordinates(found, str(path)) * unit
-                if sees_table(found, robot.table) or table_plane(found[returned(found)]) is not None:
-                    return pick_object(path.stem, found, robot), T
-        obj = load_object(self.object)
+        T, camera = np.eye(4), self._camera(robot)
+        if self.scene is not None:
+            scene = seen_on_table(load_scene(self.scene, camera=camera), robot)
+            return as_picked(find_thing(scene, self), robot), T
+        assert self.object is not None
+        if camera is not None:
+            obj = load_scan(given_path(self.object), camera.T_frame_camera)
+        else:
+            obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
         elif self.at is not None:
             if robot.table is None:
                 say_aside(f"robot '{robot.name}' states no table: z = 0 is taken for one; state `table` in the robot file")
-                robot = replace(robot, table=Table(0.0, self.at))
+                robot = replace(robot, table=Table(0.0, (self.at[0], self.at[1])))
             assert robot.table is not None
             T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
+        elif obj.table is not None and robot.table is not None:  # it was cut off the cloud
+            robot = at_seen_height(robot, obj)
         return PickedObject(obj, [], robot), T
 
-    def _camera(self, robot: Robot) -> Float[np.ndarray, "4 4"] | None:
-        """The camera's pose in the world; None if the object is in the world's frame."""
+    def _camera(self, robot: Robot) -> SceneCamera | None:
+        """The camera in the world; None if the object is in the world's frame."""
         from dro_grasp.errors import OptionError
-        from dro_grasp.frames import read_motion
+        from dro_grasp.objects.perception.scene_files import as_camera
 
         if self.camera is None:
             return None
         if self.camera != "robot":
-            return read_motion(Path(self.camera), "T_frame_camera").T.double().numpy()
+            return as_camera(self.camera)
         if robot.camera is None:
             raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
-        return robot.camera.T_world_camera
+        return robot.camera.as_seen()
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
@@ -19,7 +20,7 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
-from dro_grasp.objects.perception.choosing import Chosen, Pixel, Place, Sight, choose
+from dro_grasp.objects.perception.choosing import Chosen, Pixel, Sight, Spot, choose
 from dro_grasp.objects.perception.scene_files import (
     SceneCamera,
     as_camera,
@@ -39,6 +40,8 @@ LARGEST_GRID = 4_000_000  # Most points of such a grid; a larger one gets a wide
 MARGIN = 0.03  # Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border
 THIN = 0.004  # Edge of the cubes of which each keeps one point of a cloud [m] (ours): cameras see far more
 TOUCH = 0.003  # Distance to a scene at which a point of an object's surface lies on it [m] (ours)
+
+Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]  # Of places [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,8 @@ class Scene:
     """Vertex indices of the mesh's triangles; None for a cloud."""
     sight: Sight | None = None
     """All points as they were seen; None for a mesh."""
+    beside: tuple[Scene, ...] = ()
+    """Further scenes in the same frame, which are avoided as well."""
 
     def __repr__(self) -> str:
         made = f"cloud of {len(self.points)} points" if self.faces is None else f"mesh of {len(self.faces)} faces"
@@ -73,7 +78,22 @@ class Scene:
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Scene:
         """The same in another frame; T takes its coordinates there [m]."""
         sight = None if self.sight is None else self.sight.moved(T)
-        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces, sight)
+        beside = tuple(scene.moved(T) for scene in self.beside)
+        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces, sight, beside)
+
+    def joined(self, other: Scene | None) -> Scene:
+        """Both, to be avoided; both are in one frame."""
+        return self if other is None else replace(self, beside=(*self.beside, other))
+
+    @property
+    def parts(self) -> tuple[Scene, ...]:
+        """This scene alone, and those beside it."""
+        return (replace(self, beside=()), *(part for scene in self.beside for part in scene.parts))
+
+    def of(self, kept: Bool[np.ndarray, " n"]) -> Scene:
+        """The same with some of its points alone, of those that were seen."""
+        assert self.sight is not None
+        return _seen(self.name, self.sight.of(kept), self.name)
 
     @cached_property
     def segments(self) -> Segments:
@@ -87,8 +107,18 @@ class Scene:
                               "one object out of it, or the object's own mesh")
         return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
 
+    def points_seen(self) -> Float[np.ndarray, "n 3"]:
+        """All points as they were seen, in the scene's frame [m], as `segments` label them."""
+        assert self.sight is not None
+        return self.sight.world()
+
+    def spot(self, number: int) -> Float[np.ndarray, "3"]:
+        """The point of a thing that is nearest to the middle of its points [m]."""
+        points = self.points_seen()[self.segments.labels == number]
+        return points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
+
     def chosen(
-        self, at: Place | None = None, pixel: Pixel | None = None, mask: Any = None, nearest: bool = False
+        self, at: Spot | None = None, pixel: Pixel | None = None, mask: Any = None, nearest: bool = False
     ) -> Chosen:
         """Which points are the object's; arguments as for `object_at`."""
         segments = self.segments
@@ -97,7 +127,7 @@ class Scene:
 
     @checked
     def object_at(
-        self, at: Place | None = None, *, pixel: Pixel | None = None, mask: Any = None,
+        self, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
         nearest: bool = False, name: str | None = None,
     ) -> FoundObject:
         """The object that is meant, completed, and all else as obstacles.
@@ -131,24 +161,30 @@ class Scene:
 
         Each point of a cloud is a ball as wide as the points are apart, so that nothing slips between them. A mesh is solid.
         """
-        low = np.maximum(low, self.points.min(0) - MARGIN)
-        high = np.minimum(high, self.points.max(0) + MARGIN)
+        parts = self.parts
+        low = np.maximum(low, np.min([part.points.min(0) for part in parts], axis=0) - MARGIN)
+        high = np.minimum(high, np.max([part.points.max(0) for part in parts], axis=0) + MARGIN)
         if not (low < high).all():
             return None
-        if self.faces is not None:
-            distance = partial(signed_distances, self.points, self.faces)
-        else:
-            own = self.points[((self.points > low - MARGIN) & (self.points < high + MARGIN)).all(1)]
-            if not len(own):
-                return None
-            distance = _ball_distances(own)
+        found = [own for part in parts if (own := part._distance(low - MARGIN, high + MARGIN)) is not None]
+        if not found:
+            return None
         spacing = max(SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
         counts = np.ceil((high - low) / spacing).astype(int) + 2
-        values = banded_values(distance, low, counts, spacing)
+        values = banded_values(lambda places: np.min([own(places) for own in found], axis=0), low, counts, spacing)
         return DistanceField.from_values(torch.from_numpy(values).float(), torch.from_numpy(low).float(), spacing)
+
+    def _distance(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Distance | None:
+        """Signed distances of places to this scene alone [m], near a box; None for a cloud that has no point in it."""
+        if self.faces is not None:
+            return partial(signed_distances, self.points, self.faces)
+        own = self.points[((self.points > low) & (self.points < high)).all(1)]
+        return _ball_distances(own) if len(own) else None
 
     def require_apart(self, obj: ObjectModel) -> None:
         """Refuse a scene that contains the object itself, by an ObjectError: no hand could touch it."""
+        for scene in self.beside:
+            scene.require_apart(obj)
         if self.faces is None:
             distance, most = KDTree(self.points).query(obj.cloud)[0], 0.2
         else:
@@ -226,13 +262,14 @@ def _seen(label: str, sight: Sight, origin: str = "the depth image") -> Scene:
 
 def _check_coordinates(points: Float[np.ndarray, "n 3"], origin: str) -> None:
     if not len(points):
-        raise ObjectError(f"{origin} holds no point; leave the scene out if nothing is to be avoided")
+        raise ObjectError(f"{origin} holds no point: all are NaN or (0, 0, 0). Look from where the camera "
+                          "measures depths, or leave obstacles out if nothing is to be avoided")
     if np.abs(points).max() > FARTHEST:
         raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m; divide millimetres by 1000 "
                           f"(scale), and leave out what is farther away than {FARTHEST:g} m")
 
 
-def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Any:
+def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Distance:
     """Distances to balls around points; they overlap those of their neighbours."""
     tree = search_tree(points)
     apart = tree.query(points, k=min(4, len(points)))[0][:, -1] if len(points) > 1 else np.zeros(1)

@@ -13,7 +13,7 @@ from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, arrow, dots, render
 from dro_grasp.kinds import checked
 from dro_grasp.objects.perception.choosing import Chosen
-from dro_grasp.objects.perception.segmentation import NOTHING
+from dro_grasp.objects.perception.segmentation import NOTHING, SPECK
 from dro_grasp.objects.scenery import FoundObject, Scene
 
 PANEL = (640, 520)  # Width and height of each half [pixels]
@@ -72,7 +72,8 @@ def _groups(scene: Scene, chosen: Chosen | None) -> list[tuple[Float[np.ndarray,
     wanted = mine if mine.any() else labels >= 0
     middle = world[wanted].mean(0) if wanted.any() else np.median(world, axis=0)
     near = np.linalg.norm(world - middle, axis=1) < AROUND
-    stray, things = labels == NOTHING, avoided & (labels != NOTHING) & (labels > -2)
+    stray = (labels == NOTHING) | ((labels == SPECK) & ~avoided)
+    things = avoided & ((labels >= 0) | (labels == SPECK))
     walls = ~mine & ~stray & ~things
     found = []
     for kept, colour in ((mine, OBJECT_COLOUR), (walls, STRUCTURE_COLOUR), (things, OBSTACLE_COLOUR),

@@ -25,7 +25,7 @@ from tests.helpers.weights import untrained_weights
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.apps.server.answering import Answerer, ServerConfig, sent_grasps
-from dro_grasp.apps.server.client import sent_file
+from dro_grasp.apps.server.client import sent_file, sent_mask
 from dro_grasp.apps.server.messages import GraspAnswer, GraspCall
 
 QUICK: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
@@ -203,7 +203,17 @@ def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answer
         assert np.linalg.norm(found.obstacles.points - made.middles[k], axis=1).min() < 0.05
     with pytest.raises(ObjectError, match="shows 4 things"):
         ask(answerer, sent, camera=camera, choose={})
-    with pytest.raises(OptionError, match="leave out obstacles"):
-        ask(answerer, sent, camera=camera, choose={"nearest": True}, obstacles={"points": [[0, 0, 0]]})
+    by_mask = answerer.chosen(GraspCall(
+        hand="gripper3", object=sent, camera=camera, choose={"mask": sent_mask(made.owner == 1)}, **QUICK))
+    np.testing.assert_array_less(abs(by_mask.obj.extents - found.obj.extents), 0.01)
+    with pytest.raises(ObjectError, match=r"mask\.png"):
+        ask(answerer, sent, camera=camera, choose={"mask": sent_mask(made.owner == 1) | {"content": "aGFsbG8="}})
+    wall = {"points": [[9.0, 0.0, 0.0]]}  # in the camera's frame, as the scene
+    problem = answerer.problem(GraspCall(
+        hand="gripper3", object=sent, camera=camera, choose={"at": middle}, obstacles=wall, **QUICK))
+    assert problem.constraints.obstacles is not None
+    seen, given = problem.constraints.obstacles.parts
+    assert len(seen.points) == len(found.obstacles.points)
+    np.testing.assert_allclose(given.points[0], made.camera.T_frame_camera[:3] @ (9.0, 0.0, 0.0, 1.0), atol=1e-6)
     answer = ask(answerer, sent, camera=camera, choose={"at": middle}, num=1, least_confidence=0)
     assert answer.frame == "world"

@@ -151,7 +151,9 @@ class Answerer:
     def problem(self, call: Any) -> GraspProblem:
         """The pair of a call, with its constraints; the last few are kept."""
         found = None if call.choose is None else self.chosen(call)
-        obstacles = self.scene(call.obstacles, call.camera) if found is None else found.obstacles
+        obstacles = self.scene(call.obstacles, call.camera)
+        if found is not None and found.obstacles is not None:
+            obstacles = found.obstacles.joined(obstacles)
         constraints, hand = settings_in(call, Constraints, obstacles=obstacles), self.hand(call.hand)
         key, obj = self.object(call.object, call.camera) if found is None else (found.obj.sha256, found.obj)
         obj = obj if call.mass is None else with_mass(obj, call.mass)
@@ -213,12 +215,9 @@ class Answerer:
 
         Raises:
             ObjectError: It is not there, or it is not clear which is meant.
-            OptionError: Obstacles are given as well, or the scene is named.
+            OptionError: The scene is named.
         """
         sent, camera, choice = call.object, call.camera, call.choose
-        if call.obstacles is not None:
-            raise OptionError("choose and obstacles are given, and all else in the scene counts as obstacles; leave out "
-                              "obstacles")
         if sent.name is not None:
             raise OptionError(f"choose is given, and the object is named '{sent.name}'; send the scene")
 
@@ -230,7 +229,15 @@ class Answerer:
                 return load_scene(source, scale=sent.scale, camera=seen_by)
 
         scene = self.library.loaded("scene", (content_key(sent, camera), "seen"), load)
-        return scene.object_at(choice.at, pixel=choice.pixel, nearest=choice.nearest)
+        with tempfile.TemporaryDirectory(prefix="dro-grasp-") as folder:
+            mask = None
+            if choice.mask is not None:
+                mask = Path(folder) / "mask.png"
+                mask.write_bytes(choice.mask.content)
+            try:
+                return scene.object_at(choice.at, pixel=choice.pixel, mask=mask, nearest=choice.nearest)
+            except DroGraspError as error:
+                raise type(error)(str(error).replace(f"{folder}/", "")) from error
 
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
         with unpacked(sent, self.library.own["object"]) as source:

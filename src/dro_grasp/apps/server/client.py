@@ -52,7 +52,8 @@ class GraspClient:
                 (n, 3), as an array, tensor or nested lists [m].
             num: Grasps to return.
             options: What else a request holds, such as direction, table, mass, camera, protocol; scale and keep_table are the
-                object's, and obstacles is a path or points, as the object is. Numbers may be arrays or tensors.
+                object's, and obstacles is a path or points, as the object is. choose says which thing of a scene is meant: a
+                dict of at, pixel, nearest or mask, which is an array or the path of a PNG. Numbers may be arrays or tensors.
 
         Raises:
             OptionError: A value cannot be sent.
@@ -62,6 +63,8 @@ class GraspClient:
         options = {present(name, FORMER_CONSTRAINTS): value for name, value in options.items()}
         if options.get("obstacles") is not None:
             options["obstacles"] = sent_object(options["obstacles"])
+        if (options.get("choose") or {}).get("mask") is not None:
+            options["choose"] = options["choose"] | {"mask": sent_mask(options["choose"]["mask"])}
         call = {"hand": hand, "object": sent_object(obj) | of_object, "num": num, "id": uuid.uuid4().hex, **options}
         return self.ask("POST", "/grasps", call)
 
@@ -129,6 +132,17 @@ def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
                           "of one that the server knows, the path of a mesh or cloud, or points (n, 3)")
     np.save(file := io.BytesIO(), points)
     return sent_file("cloud.npy", file.getvalue())
+
+
+def sent_mask(mask: str | Path | ArrayLike) -> dict[str, Any]:
+    """A mask as a request holds it: a PNG, not black where it is true or not 0."""
+    if isinstance(mask, str | Path):
+        return sent_file("mask.png", given_path(mask).read_bytes())["file"]
+    import numpy as np
+    from PIL import Image
+
+    Image.fromarray(np.asarray(mask) != 0).save(file := io.BytesIO(), format="PNG")
+    return sent_file("mask.png", file.getvalue())["file"]
 
 
 def sent_file(name: str, content: bytes) -> dict[str, Any]:

@@ -98,7 +98,7 @@ class SentCamera(Message):
 
 
 class SentChoice(Message):
-    """Which thing of a scene is the object: one of the three, or none where there is one thing alone."""
+    """Which thing of a scene is the object: one of the four, or none where there is one thing alone."""
 
     at: Point | None = None
     """A place on it, in the frame of the grasps [m]."""
@@ -106,6 +106,8 @@ class SentChoice(Message):
     """A pixel that shows it: column and row."""
     nearest: bool = False
     """Take the one nearest to the camera."""
+    mask: SentFile | None = None
+    """A PNG of the image's size that is not black on the object alone."""
 
 
 class _Call(Message):

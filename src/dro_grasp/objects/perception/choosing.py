@@ -13,11 +13,12 @@ from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
-from dro_grasp.objects.perception.segmentation import NOTHING, STRUCTURE, Segments
+from dro_grasp.objects.perception.segmentation import NOTHING, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
-Place = Sequence[float] | Float[np.ndarray, "3"]  # x, y, z [m]
+Spot = Sequence[float] | Float[np.ndarray, "3"]  # x, y, z [m]
 Pixel = Sequence[float] | Float[np.ndarray, "2"]  # Column and row, from the upper left
+ON = 0.01  # Way from a given place to a point of a thing up to which it lies on that thing [m] (ours)
 BESIDE = 0.05  # Longest way from a given place to the thing that is meant [m] (ours)
 ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
 BORDER = 3  # Pixels from the image's border that touch it (ours)
@@ -47,6 +48,10 @@ class Sight:
         """The same in another frame; T takes the scene's coordinates there [m]."""
         return replace(self, T=T @ self.T)
 
+    def of(self, kept: Bool[np.ndarray, " n"]) -> Sight:
+        """Some of the points alone."""
+        return replace(self, points=self.points[kept], pixels=self.pixels[kept])
+
     def image(self) -> Float[np.ndarray, "n 2"] | None:
         """Column and row of each point; None where neither an image nor intrinsics tell them."""
         if self.shape is not None:
@@ -69,7 +74,7 @@ class Chosen:
 
 
 def choose(
-    name: str, sight: Sight, segments: Segments, at: Place | None, pixel: Pixel | None, mask: Any,
+    name: str, sight: Sight, segments: Segments, at: Spot | None, pixel: Pixel | None, mask: Any,
     nearest: bool,
 ) -> Chosen:
     """The points of the thing that is meant; see `Scene.object_at`."""
@@ -136,7 +141,7 @@ def _planes(segments: Segments) -> str:
     return f"{len(areas)} {'plane' if len(areas) == 1 else 'planes'} ({', '.join(areas)})" if areas else "no plane"
 
 
-def _at(name: str, sight: Sight, segments: Segments, at: Place) -> int:
+def _at(name: str, sight: Sight, segments: Segments, at: Spot) -> int:
     place = numbers(at, "at").astype(np.float64)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise OptionError(f"at is {place.tolist()}; give x, y and z in metres")
@@ -145,7 +150,7 @@ def _at(name: str, sight: Sight, segments: Segments, at: Place) -> int:
     away = np.linalg.norm(world[things] - place, axis=1)
     closest = int(away.argmin())
     # A place may lie within a thing, of which a camera sees only the near side.
-    within = _inside(world, labels, place, segments.count)
+    within = None if away[closest] < ON else _inside(world, labels, place, segments.count)
     if away[closest] > BESIDE and within is None:
         raise ObjectError(f"'{name}' shows no thing within {100 * BESIDE:.0f} cm of {place_of(place[None])}: the nearest is "
                           f"{100 * away[closest]:.0f} cm away. It shows {listed(sight, segments)}")
@@ -182,7 +187,8 @@ def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> int:
                           f"{listed(sight, segments)}")
     number = int(segments.labels[closest])
     if number < 0:
-        what = {STRUCTURE: "a table, board or wall", NOTHING: "scattered points"}.get(number, "something too large or far away")
+        what = {STRUCTURE: "a table, board or wall", NOTHING: "scattered points", SPECK: "something too small"}.get(
+            number, "something too large or far away")
         raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}; '{name}' shows {listed(sight, segments)}")
     return number
 
@@ -222,6 +228,10 @@ def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes:
     taken[own] = True
     below = _below(sight, segments, own)
     avoided = (labels != NOTHING) & ~taken
+    # Specks beside a thing are parts of it that the camera saw badly, or what it scatters at its outline.
+    specks = np.flatnonzero(labels == SPECK)
+    if len(specks):
+        avoided[specks[KDTree(sight.points[own]).query(sight.points[specks])[0] < BESIDE]] = False
     if below is not None:
         plane = segments.planes[below]
         # Hands stay above the table by another way.

@@ -38,6 +38,7 @@ BACK = 0.03  # Points so far behind a plane are the edges of its board [m] (ours
 LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
 CORE = 5  # Neighbours of a cube that joins others (ours): single points between two things, as cameras make, join none
 LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetres
+LEAST_SPECK = 5  # Filled cubes of what hands avoid, at least (ours)
 LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours)
 FRAGMENT = 0.015  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
@@ -45,6 +46,7 @@ PART = 0.15  # Share of a thing that both sides of a seam have, at least [1] (ou
 NOTHING = -1  # Label of scattered points; things have numbers from 0
 STRUCTURE = -2  # Label of tables, boards and walls
 OTHER = -3  # Label of what is too large or too far away to be meant
+SPECK = -4  # Label of what is too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ class Segments:
     """What a view shows."""
 
     labels: Int[np.ndarray, " n"]
-    """Of each point: the number of its thing, the one with most points first, or NOTHING, STRUCTURE or OTHER."""
+    """Of each point: the number of its thing, the one with most points first, or NOTHING, STRUCTURE, OTHER or SPECK."""
     planes: tuple[Float[np.ndarray, "4"], ...]
     """Planes: unit normals to the side from which they were seen, and heights along them [m]."""
     areas: tuple[float, ...]
@@ -267,6 +269,7 @@ def _things(
         labels[own] = len(seams)
         seams.append(_has_seam(view, rest, np.flatnonzero(own), pairs))
     _take_fragments(cells, labels)
+    labels[(labels == NOTHING) & (sizes[group] >= LEAST_SPECK)] = SPECK
     return labels, tuple(seams)
 
 

@@ -1,0 +1,53 @@
+"""Options of a scene: which thing of what a camera saw is meant, and the picture of what was taken."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dro_grasp.cli.output import say_aside
+
+if TYPE_CHECKING:
+    from dro_grasp.cli.generate import Generate
+    from dro_grasp.cli.robots import Plan
+    from dro_grasp.objects.scenery import FoundObject, Scene
+
+CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
+
+
+def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
+    """Refuse options that contradict one another, by an OptionError; `own` ones mean something without a scene, too."""
+    from dro_grasp.errors import OptionError
+    from dro_grasp.files import check_output
+
+    if (command.object is None) == (command.scene is None):
+        raise OptionError("give --object NAME|PATH, or --scene CLOUD|DEPTH with the thing that is meant "
+                          f"({', '.join(CHOICES)}); {'neither is' if command.object is None else 'both are'} given")
+    given = [option for option in CHOICES if getattr(command, option[2:]) not in (None, False)]
+    if command.scene is None:
+        concern = [option for option in given if option not in own]
+        concern += ["--scene-picture"] * (command.scene_picture is not None)
+        if concern:
+            raise OptionError(f"{' and '.join(concern)} concern a scene; give it by --scene instead of --object")
+    elif len(given) > 1:
+        raise OptionError(f"{' and '.join(given)} each say which thing of the scene is meant; give one of them")
+    if command.scene_picture is not None:
+        check_output(command.scene_picture, ".png")
+
+
+def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
+    """The one thing of the scene that is meant; the picture is drawn even where none is."""
+    from dro_grasp.errors import ObjectError
+    from dro_grasp.pictures.scene import draw_scene
+
+    picture = command.scene_picture
+    try:
+        found = scene.object_at(command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest)
+    except ObjectError:
+        if picture is not None and scene.sight is not None:
+            draw_scene(scene, None, picture)
+            say_aside(f"what the scene shows: {picture}")
+        raise
+    if picture is not None:
+        draw_scene(scene, found, picture)
+        say_aside(f"what was taken for the object: {picture}")
+    return found
