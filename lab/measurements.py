@@ -195,9 +195,6 @@ MEASUREMENTS = {
             ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", "--protocol carry "),
             ("synthesis", "--protocol carry "))}, wings=("compare", "training", "cli"), alone=True),
     "gpu": Measurement("Times on a GPU", {
-        "device": "python -m lab.benchmarks.device --quick --json",
-        "trials": "python -m lab.benchmarks.device_trials --json",
-        "training": "python -m lab.benchmarks.training --device cuda --quick --json"}, wings=("training",), alone=True,
-        device="cuda"),
+        "table": "python -m lab.benchmarks.gpu_table --json"}, wings=("training",), alone=True, device="cuda"),
 }
 """Everything that README and docs tell, by name."""

@@ -454,7 +454,7 @@ def state(results: Results) -> str:
 
 def gpu(results: Results) -> str:
     """What a GPU does, if one was at hand."""
-    found = results.cell("gpu", "device")
+    found = results.cell("gpu", "table")
     return f"{found['machine']['cuda']}: see `lab/results/gpu.json`."
 
 

@@ -1,11 +1,13 @@
 """Prediction and synthesis on a GPU, beside the processor in the same run.
 
-Hands and objects are built in. Prediction is of candidates of the network alone: many of one pair, some of many pairs of one
-hand, and the four of which one grasp is chosen, by stage, with settling and without. The first run, which captures graphs, is
-told apart. Many pairs are of sixteen objects, each of which comes four times as an object of its own. Synthesis is the
-optimiser's descent, without trials; shards are all of it, in one process. `lab.benchmarks.training` is for training.
+Hands and objects are built in. Prediction is of candidates of the network alone, sixteen for each grasp that is returned: many
+of one pair, some of many pairs of one hand, and the four of which one grasp is chosen, by stage, with settling and without. The
+first run, which captures graphs, is told apart. Many pairs are of sixteen objects, each of which comes four times as an object
+of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process. Training is measured by
+`lab.benchmarks.training`, and all of it in a few minutes by `lab.benchmarks.gpu_table`.
 
-    python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--quick] [--json]
+    python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--settled] [--alone] [--quick]
+        [--record FILE] [--json]
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 from dro_grasp.devices import require_device
 from dro_grasp.hands.hand import Hand
@@ -30,14 +33,16 @@ from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import problems_of
 from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, note
 
 HAND, OBJECT = "allegro", "rubber_duck"
 REPETITIONS = 5
-PREDICTIONS = {"cpu": ((1, 16, 1), (1, 1, 4)), "gpu": ((1, 1024, 1), (64, 16, 1), (1, 1, 4))}
+ONE, MANY, SINGLE = "one pair", "many pairs", "one grasp"
+PREDICTIONS = {"cpu": {ONE: (1, 2, 16), MANY: (4, 1, 4), SINGLE: (1, 1, 4)},
+               "gpu": {ONE: (1, 64, 16), MANY: (64, 1, 16), SINGLE: (1, 1, 4)}}
 """Pairs, grasps of each, and candidates of each grasp."""
 STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
-SETTLED = (False, True)  # Whether candidates close in simulation, on the processor
+SETTLED = (True, False)  # Whether candidates close in simulation
 DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 SHARES = {"cpu": (1.0,), "gpu": (1.0, 0.1)}
@@ -69,13 +74,13 @@ def objects(count: int) -> list[ObjectModel]:
     return again
 
 
-def predictions(device: str, repetitions: int) -> list[list[object]]:
+def predictions(device: str, repetitions: int, options: argparse.Namespace) -> list[list[object]]:
     """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates a second."""
     hand, rows = load_hand(HAND), []
-    for settled in SETTLED:
+    for settled in SETTLED[:1] if options.settled else SETTLED:
         finish = FinishConfig() if settled else FinishConfig(settle=None)
         predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
-        for pairs, num, candidates in PREDICTIONS[kind(device)]:
+        for name, (pairs, num, candidates) in PREDICTIONS[kind(device)].items():
             models, count = objects(pairs), pairs * num * candidates
             request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)
             # Closing in simulation takes most of the time, and is timed once.
@@ -86,6 +91,8 @@ def predictions(device: str, repetitions: int) -> list[list[object]]:
             whole = statistics.median(seconds for seconds, _ in kept)
             parts = [1e3 * statistics.median(stages[name] for _, stages in kept) / count for name in STAGES]
             what = f"{pairs} x {num} x {candidates}, {'settled' if settled else 'scored'}"
+            note(options.record, f"{name}, {'settled' if settled else 'scored'}", device=device, rate=count / whole,
+                 milliseconds=1e3 * whole, first=runs[0][0], stages=dict(zip(STAGES, parts, strict=True)), candidates=count)
             rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{part:.3f}" for part in parts),
                               f"{1e3 * whole / count:.3f}", f"{count / whole:.1f}"]))
     return rows
@@ -115,7 +122,7 @@ def descents(device: str, repetitions: int) -> list[list[object]]:
     return rows
 
 
-def shards(device: str) -> list[list[object]]:
+def shards(device: str, options: argparse.Namespace) -> list[list[object]]:
     """Rows of whole shards, which one process makes and confirms: candidates, and valid grasps a second."""
     hand, obj, rows = load_hand(HAND), load_object(OBJECT), []
     for share in SHARES[kind(device)]:
@@ -123,6 +130,8 @@ def shards(device: str) -> list[list[object]]:
         begin = time.perf_counter()
         _, made = valid_grasps(hand, obj, 0, config)
         seconds = time.perf_counter() - begin
+        note(options.record, f"shard, {share:g} confirmed", device=device, rate=made.valid / seconds, valid=made.valid,
+             candidates=made.candidates, judged=made.judged, seconds=seconds)
         what = f"shard of {made.candidates} candidates, {made.judged} of {made.valid} confirmed"
         rows.append(said([what, device, *BLANK, f"{1e3 * seconds / made.candidates:.3f}", made.valid / seconds]))
     return rows
@@ -144,19 +153,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor")
     parser.add_argument("--only", default="prediction,synthesis,shards", help="what is measured, by commas")
+    parser.add_argument("--settled", action="store_true", help="predictions with settling alone")
+    parser.add_argument("--alone", action="store_true", help="leave out the processor")
     parser.add_argument("--quick", action="store_true", help="one repetition")
+    parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     require_device(options.device)
     repetitions, only = 1 if options.quick else REPETITIONS, options.only.split(",")
     rows: list[list[object]] = []
-    for device in dict.fromkeys((options.device, "cpu")):
+    for device in dict.fromkeys((options.device, *(() if options.alone else ("cpu",)))):
         if "prediction" in only:
-            rows += predictions(device, repetitions)
+            rows += predictions(device, repetitions, options)
         if "synthesis" in only:
             rows += descents(device, repetitions)
         if "shards" in only:
-            rows += shards(device)
+            rows += shards(device, options)
     emit(
         f"{HAND} and {OBJECT}, or 64 objects; pairs x grasps x candidates: median of {repetitions}; milliseconds for each "
         "candidate", rows, ["what", "device", "first run [s]", *STAGES, "whole", "a second"],

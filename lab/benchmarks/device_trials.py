@@ -5,7 +5,7 @@ objects. Speed is of the network's refined candidates of one hand and object, re
 Settling is that of the same candidates, by part.
 
     python -m lab.benchmarks.device_trials [--device cuda] [--grasps FILE ...] [--num N] [--protocols NAME ...]
-        [--worlds N ...] [--settled N] [--hand HAND] [--object NAME] [--json]
+        [--worlds N ...] [--settled N] [--hand HAND] [--object NAME] [--record FILE] [--json]
 
 `--device warp` is MuJoCo Warp on the processor: about one closing a second.
 """
@@ -39,7 +39,7 @@ from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import TrialResult, simulate
 from lab.benchmarks.agreement import kappa
-from lab.benchmarks.report import emit, rate
+from lab.benchmarks.report import emit, note, rate
 
 FILES = tuple(Path("data/grasps") / f"{name}.parquet" for name in ("allegro", "barrett", "shadowhand"))
 OBJECTS = 4
@@ -71,6 +71,9 @@ def agreement(path: Path, protocol: str, options: argparse.Namespace) -> list[li
         seconds += time.perf_counter() - begin
         tell(f"{hand.name} {name} {protocol}", first, second)
         results.append((first.success, second.success))
+        one, other = (torch.cat(column) for column in zip(*results, strict=True))
+        note(options.record, f"agreement, {path.stem}, {protocol}", device=options.device, same=int((one == other).sum()),
+             grasps=len(one), asked=options.num, seconds=seconds)
     one, other = (torch.cat(column) for column in zip(*results, strict=True))
     return [compared(f"{hand.name}, {protocol}", one, other, len(one) / seconds)]
 
@@ -118,12 +121,16 @@ def speed(grasps: GraspBatch, worlds: int, options: argparse.Namespace) -> list[
         begin = time.perf_counter()
         found = run()
         known = expected if run is whole else torch.ones_like(found)
-        rows.append(compared(f"{what}, {worlds} at once", known, found, worlds / (time.perf_counter() - begin)))
+        seconds = time.perf_counter() - begin
+        note(options.record, what, device=options.device, rate=worlds / seconds, worlds=worlds,
+             same=int((known == found).sum()))
+        rows.append(compared(f"{what}, {worlds} at once", known, found, worlds / seconds))
     return rows
 
 
 PARTS = (
-    (settling, "settle"), (settling, "pressed"), (settling, "grasp_state"), (settling, "refine_all"), (settling, "grip_all"),
+    (settling, "settle_many"), (settling, "pressed_many"), (settling, "grasp_state_many"), (settling, "refine_all"),
+    (settling, "grip_all"),
     (settling, "deepest_penetration"), (grasp_state.Pressed, "payloads"), (grasp_state, "contact_forces"),
     (grasp_state, "squeezes_of"), (grasp_state, "unanswered"), (grasp_state, "pierced"), (trial, "find_contact_links"),
     (Rollout, "_advance"),
@@ -182,6 +189,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--settled", type=int, default=1024, help="grasps to settle; 0: none")
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="rubber_duck")
+    parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     lines = [line for path in options.grasps for name in options.protocols for line in agreement(path, name, options)]

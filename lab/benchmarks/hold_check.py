@@ -28,10 +28,11 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.simulation.conditions import draw
 from dro_grasp.simulation.holding import closing_of, expect_hold, rest
 from dro_grasp.simulation.payload import GRAVITY, servo_torques
 from dro_grasp.simulation.protocols import ROBUST
-from dro_grasp.simulation.rollout import Rollout, draw
+from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import scene_of
 from lab.benchmarks.report import emit
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -65,6 +66,14 @@ def emit(
     for key, value in json_object.items():
         if isinstance(value, int | float | str):
             print(f"{key}: {_cell(value)}")
+
+
+def note(path: Path | None, name: str, **values: object) -> None:
+    """Append a result to a file of JSON lines, if one is given: whatever ends the run later, it is kept."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(json.dumps({"name": name, **values, "machine": machine()}) + "\n")
 
 
 def rate(held: Collection[bool] | np.ndarray | Tensor, asked: int | None = None) -> str:

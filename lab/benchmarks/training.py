@@ -4,7 +4,8 @@ Hands are built in; objects are ellipsoids, one of them as flat as a phone, and 
 alone. Steps are those of `train`, timed by its log once they are warm; a GPU multiplies in bfloat16, as `--mixed` has it.
 `--against` runs the same with the package of another folder first.
 
-    python -m lab.benchmarks.training [--device cuda] [--quick] [--profile] [--exact] [--against FOLDER/src] [--json]
+    python -m lab.benchmarks.training [--device cuda] [--quick] [--profile] [--exact] [--against FOLDER/src] [--record FILE]
+        [--json]
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, ObjectCloud, write_bundle
 from dro_grasp.training.loop import train
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, note
 
 HANDS = ("allegro", "barrett", "gripper3", "leaphand", "shadowhand")
 OBJECTS, FLAT = 48, 0.004
@@ -118,6 +119,8 @@ def speeds(options: argparse.Namespace) -> dict[str, float]:
                     print(f"{preset}, {samples}: {str(error)[:80]}", file=sys.stderr)
                     continue
                 found[f"{preset} {samples}"] = samples / seconds
+                note(options.record, f"training, {preset}", device=options.device, rate=samples / seconds, samples=samples,
+                     exact=options.exact)
                 memory = torch.cuda.max_memory_allocated() / 2**30 if torch.cuda.is_initialized() else 0.0
                 print(f"{options.label}{preset}, {samples} a step: {samples / seconds:.0f} samples/s, {1e3 * seconds:.0f} ms a "
                       f"step, {memory:.1f} GiB\n{profiled}", file=sys.stderr, flush=True)
@@ -142,6 +145,7 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="also profile one step of each")
     parser.add_argument("--exact", action="store_true", help="single precision on a GPU too")
     parser.add_argument("--against", type=Path, help="source folder of another state of the package")
+    parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
     parser.add_argument("--label", default="", help=argparse.SUPPRESS)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()

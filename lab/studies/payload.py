@@ -29,12 +29,13 @@ from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import weigh_settled
+from dro_grasp.simulation.conditions import Conditions
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.forces import largest_payloads
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press, squeezes_of
 from dro_grasp.simulation.payload import Squeezes
 from dro_grasp.simulation.pressure import contact_forces
-from dro_grasp.simulation.rollout import Conditions, Rollout, rollouts
+from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import TrialScene, scene_of
 from dro_grasp.simulation.trial import run_trial
 from dro_grasp.simulation.weighing import WeighingConfig, observed

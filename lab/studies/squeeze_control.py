@@ -22,7 +22,7 @@ import dro_grasp as dro
 from dro_grasp.grasps.forces import squeeze_efforts
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.outcome import FORCES
-from dro_grasp.simulation.rollout import quiet
+from dro_grasp.simulation.quiet import quiet
 from dro_grasp.simulation.scene import TrialScene, scene_of, servo_joints
 
 GRAVITY = 9.81  # [m/s^2]

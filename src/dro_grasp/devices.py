@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, cached_property
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import torch
@@ -85,6 +86,23 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
 
     with one_thread(), ThreadPoolExecutor(threads, initializer=prepare) as pool:
         return list(pool.map(lambda job: work(*job), jobs))
+
+
+FEWEST_ROWS = 64
+"""Rows for which a thread is begun (ours): fewer take less time than it."""
+
+
+def over_cores(work: Callable[[slice], list[Result]], count: int) -> list[Result]:
+    """The results of work on so many rows, in their order, by as many threads as there are cores.
+
+    It is for work that gives up Python's lock, as calls of MuJoCo do.
+    """
+    threads = min(cores(), count // FEWEST_ROWS)
+    if threads < 2:
+        return work(slice(0, count))
+    ends = [count * i // threads for i in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        return [one for part in pool.map(lambda own: work(slice(*own)), pairwise(ends)) for one in part]
 
 
 MEMORY_SHARE = 0.25

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +24,8 @@ from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
-from lab.benchmarks import agreement, data_card, dexgraspbench, dexgraspbench_official
+from lab.benchmarks import agreement, data_card, dexgraspbench, dexgraspbench_official, gpu_table
+from lab.benchmarks.report import note
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -153,3 +156,49 @@ def test_what_a_filter_keeps_is_counted_with_its_diversity(tmp_path: Path) -> No
         joints = batch.joints.double().numpy().std(0, ddof=1)
         wanted = [np.concatenate([wrist, joints]).mean(), wrist.mean(), joints.mean()]
         assert [float(told[name]) for name in names] == pytest.approx(wanted, abs=6e-4)
+
+
+def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first part is done, the second is cut off, the third fails, and the fourth leaves half a line."""
+    record, begun = tmp_path / "rows" / "gpu.jsonl", []
+
+    def run(command: list[str], timeout: float, **_: object) -> SimpleNamespace:
+        begun.append(command)
+        assert command[-2:] == ["--record", str(record)]
+        if len(begun) == 1:
+            for name in gpu_table.parts("cuda")[0][0]:
+                note(record, name, device="cuda", rate=600.0, milliseconds=151.0, candidates=1024)
+        elif len(begun) == 2:
+            note(record, "closings", device="cuda", rate=4999.0, worlds=4096)
+            raise subprocess.TimeoutExpired(command, timeout)
+        elif len(begun) == 4:
+            with record.open("a") as file:
+                file.write('{"name": "shard, 1 confirmed", "devi')
+        return SimpleNamespace(returncode=int(len(begun) == 3))
+
+    monkeypatch.setattr(gpu_table, "subprocess", SimpleNamespace(run=run, **{
+        name: getattr(subprocess, name) for name in ("DEVNULL", "TimeoutExpired")}))
+    monkeypatch.setattr(gpu_table, "require_device", lambda name: None)
+    gpu_table.main(["--record", str(record)])
+    names = [name for names, _ in gpu_table.parts("cuda") for name in names]
+    assert sorted(names) == sorted(row.name for row in gpu_table.ROWS)
+    assert len(begun) == len(gpu_table.parts("cuda"))
+    shown = capsys.readouterr().out
+    table = gpu_table.lines(gpu_table.noted(record, "cuda"))
+    assert [(row[1], row[4]) for row in table[:5]] == [
+        (600.0, "yes"), (600.0, "yes"), (151.0, "no"), (4999.0, "no"), ("blank", "")]
+    assert all(row[1] == "blank" for row in table[5:])
+    assert shown.count("blank") == len(table) - 4 + 1
+    with record.open("a") as file:
+        file.write("\n")
+    for hand, grasps in (("allegro", 400), ("barrett", 100)):
+        note(record, f"agreement, {hand}, strict", device="cuda", same=grasps - 1, grasps=grasps, asked=400)
+    note(record, "training, multi", device="cpu", rate=1.0)
+    begun.clear()
+    gpu_table.main(["--record", str(record), "--minutes", "1"])
+    assert {command[2].rpartition(".")[2] for command in begun} == {"device_trials", "training", "device"}
+    assert not any("prediction" in command for command in begun)
+    assert not any("data/grasps/allegro.parquet" in command for command in begun)
+    assert any("data/grasps/barrett.parquet" in command for command in begun)

@@ -119,7 +119,7 @@ def test_what_held_the_mass_as_it_settled_carries_it_at_least(grasps: dro.GraspB
 
 def test_the_time_for_weighing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With weighing that takes a quarter of a second more, and easing that takes half of that more."""
-    weigh, ease, slept = finish.weigh_settled, finish.ease, []
+    weigh, ease, slept = finish.weigh_settled_all, finish.ease, []
 
     def slow_weigh(*given: Any) -> Any:
         slept.append("weigh")
@@ -134,7 +134,7 @@ def test_the_time_for_weighing_is_told(tmp_path: Path, monkeypatch: pytest.Monke
     predictor, problem = dro.GraspPredictor(str(untrained_weights(tmp_path))), GraspProblem(HAND, CAN)
     request = dro.GraspRequest(num=4, candidates=1, source="network")
     predictor.run(problem, request)
-    monkeypatch.setattr(finish, "weigh_settled", slow_weigh)
+    monkeypatch.setattr(finish, "weigh_settled_all", slow_weigh)
     monkeypatch.setattr(finish, "ease", slow_ease)
     begin = time.perf_counter()
     made = predictor.run(problem, request)

@@ -13,9 +13,10 @@ from dro_grasp.grasps.controller import complete
 from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation, check_hold
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
+from dro_grasp.simulation.conditions import draw
 from dro_grasp.simulation.holding import closing_of, expect_hold, rest
 from dro_grasp.simulation.protocols import ROBUST
-from dro_grasp.simulation.rollout import Rollout, draw
+from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import scene_of
 from tests.helpers.claw import ball, claw, power_grasp
 

@@ -19,10 +19,11 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import rollout as rollouts, trial as trials
+from dro_grasp.simulation.conditions import Conditions, draw
 from dro_grasp.simulation.contacts import count_fingers, measure_penetration
 from dro_grasp.simulation.outcome import Failure, TrialResult, verdict
 from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol
-from dro_grasp.simulation.rollout import Conditions, Rollout, draw
+from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import record, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below

@@ -13,7 +13,8 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.simulation import scene
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.rollout import ObjectState, _matrices, quiet, rollouts
+from dro_grasp.simulation.quiet import quiet
+from dro_grasp.simulation.rollout import ObjectState, _matrices, rollouts
 
 ROTATIONS = Rotation.random(200, random_state=0)
 

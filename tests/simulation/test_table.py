@@ -19,7 +19,8 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.rollout import Rollout, lowest_points, rollouts, stands
+from dro_grasp.simulation.resting import lowest_points, stands
+from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import simulate
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import mujoco.batch
 import numpy as np
 import pytest
 import torch
@@ -22,20 +21,20 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
+from dro_grasp.simulation.joint_model import joint_model
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.payload import PayloadConfig, given_way, payloads
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import CARRY, Perturbations, Protocol, protocol
 from dro_grasp.simulation.rollout import Rollout
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import settle, simulate
 from dro_grasp.simulation.warp_worlds import Room
 from dro_grasp.simulation.worlds import STATE, WARP
 from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.worker import EngineConfig
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
-
-State = dict[str, np.ndarray]
+from tests.helpers.warp_steps import State, Steps
 
 
 @pytest.fixture(scope="module")
@@ -54,30 +53,6 @@ def grasps(hand: Hand, obj: ObjectModel) -> GraspBatch:
     made = GraspBatch.concatenate([
         power_grasp(hand, obj, 3), grasps_of(hand, obj, wrist_below(0.3), torch.tensor([[0.0, 0.6] * 4]))])
     return complete(hand, made, torch.as_tensor(obj.centre_of_mass))
-
-
-class Steps:
-    """MuJoCo where Warp's graphs would be, with whatever is done to the outcome of a call."""
-
-    def __init__(self, change: Callable[[State, np.ndarray], None] = lambda state, missed: None) -> None:
-        self.change, self.calls = change, list[int]()
-
-    def __call__(self, scene: TrialScene, device: str, fields: tuple[str, ...]) -> Steps:
-        self.scene, self.fields = scene, fields
-        return self
-
-    def step(self, inputs: State, fields: State, count: int) -> tuple[State, np.ndarray]:
-        number = len(inputs["qpos"])
-        self.calls.append(number)
-        batch, missed = mujoco.batch.Batch(self.scene.model, nsim=number, nthread=1), np.zeros(number, bool)
-        for name, values in inputs.items():
-            batch.bind(name)[:] = values
-        for name, values in fields.items():
-            batch.expand(name)[:] = values
-        batch.step(nstep=count)
-        state = {name: np.array(batch.bind(name)) for name in STATE}
-        self.change(state, missed)
-        return state, missed
 
 
 @pytest.fixture
@@ -177,7 +152,7 @@ def test_the_processor_judges_what_holds_on_a_device(
     expected, start = simulate(hand, obj, grasps, CARRY), Rollout(cached_scene(hand, obj, CARRY), grasps, 1)
 
     def stand_still(state: State, missed: np.ndarray) -> None:
-        state["qpos"][:], state["qvel"][:], state["qacc_warmstart"][:] = start.qpos[:len(state["qpos"])], 0.0, 0.0
+        state["qpos"][:], state["qvel"][:], state["qacc_warmstart"][:] = np.resize(start.qpos, state["qpos"].shape), 0.0, 0.0
 
     steps(stand_still)
     assert simulate(hand, obj, grasps, CARRY, device="cuda", confirm=False).success.sum() > expected.success.sum()
@@ -200,7 +175,7 @@ def test_room_grows_for_contacts_at_once_and_for_constraints_where_many_worlds_l
 
 
 def test_graphs_are_of_few_sizes(hand: Hand, obj: ObjectModel) -> None:
-    graphs = warp_worlds._Graphs(cached_scene(hand, obj, CARRY), "cuda", ())
+    graphs = warp_worlds._Graphs(joint_model((cached_scene(hand, obj, CARRY),)), "cuda", ())
     assert [graphs.number(n) for n in (1000, 300, 1024, 256, 200, 3, 128, 2049)] == [1024, 1024, 1024, 256, 256, 128, 128, 4096]
 
 

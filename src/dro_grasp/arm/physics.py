@@ -25,7 +25,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
-from dro_grasp.simulation.rollout import quiet
+from dro_grasp.simulation.quiet import quiet
 from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, servo_joints
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)

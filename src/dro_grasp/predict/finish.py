@@ -24,7 +24,7 @@ from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violation
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
-from dro_grasp.predict.settling import SettleConfig, SettledBest, can_settle, settle_best_all, weigh_settled
+from dro_grasp.predict.settling import SettleConfig, SettledBest, can_settle, settle_best_all, weigh_settled_all
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine_all, score_all
 from dro_grasp.simulation.weighing import WeighingConfig
@@ -116,14 +116,7 @@ class Finished:
     @cached_property
     def grasps(self) -> GraspBatch:
         """The best, complete, weighed and eased, as they are returned."""
-        best, settling = self.problem.on_table(self.pool[self.rows]), self.config.settle
-        if self.config.weigh is not None and settling is not None and bool(best.payload.isfinite().any()):
-            with self.watch("weigh"):
-                best = best.replace(payload=weigh_settled(self.problem, best, self.config.weigh, settling))
-        if self.config.ease is None:
-            return best
-        with self.watch("ease"):
-            return ease(self.problem, best, self.config.ease, self.config.admission)
+        return complete_grasps([self])[0]
 
     @property
     def proposed(self) -> Candidates:
@@ -186,6 +179,36 @@ def finish_all(
                      own.doubts) for i, (problem, own) in enumerate(zip(problems, settled, strict=True))]
     return done if rivals is None else [own if other is None else own.beside(other) for own, other in zip(
         done, rivals, strict=True)]
+
+
+def complete_grasps(finished: Sequence[Finished]) -> list[GraspBatch]:
+    """What `Finished.grasps` is of several objects of a hand, together where that is quicker; each then knows it."""
+    lacking = [own for own in finished if "grasps" not in vars(own)]
+    best = [own.problem.on_table(own.pool[own.rows]) for own in lacking]
+    for grasps, own in zip(_weighed(lacking, best), lacking, strict=True):
+        vars(own)["grasps"] = grasps
+        if own.config.ease is not None:
+            with own.watch("ease"):
+                vars(own)["grasps"] = ease(own.problem, grasps, own.config.ease, own.config.admission)
+    return [own.grasps for own in finished]
+
+
+def _weighed(finished: Sequence[Finished], best: Sequence[GraspBatch]) -> list[GraspBatch]:
+    """The best grasps with payloads that were found in simulation; each takes an equal share of the time."""
+    found = list(best)
+    for config in dict.fromkeys((own.config.weigh, own.config.settle) for own in finished):
+        weighing, settling = config
+        rows = [i for i, own in enumerate(finished) if (own.config.weigh, own.config.settle) == config
+                and bool(best[i].payload.isfinite().any())]
+        if weighing is None or settling is None or not rows:
+            continue
+        watch = Stopwatch()
+        with watch("weigh"):
+            payloads = weigh_settled_all([finished[i].problem for i in rows], [best[i] for i in rows], weighing, settling)
+        for i, payload in zip(rows, payloads, strict=True):
+            found[i] = best[i].replace(payload=payload)
+            finished[i].watch.seconds["weigh"] += watch.seconds["weigh"] / len(rows)
+    return found
 
 
 def _refined(

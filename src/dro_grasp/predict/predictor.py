@@ -29,7 +29,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.starts import Direction
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.finish import FinishConfig, Finished, finish_all
+from dro_grasp.predict.finish import FinishConfig, Finished, complete_grasps, finish_all
 from dro_grasp.predict.problem import GraspProblem, problems_of
 from dro_grasp.predict.settling import can_settle
 from dro_grasp.predict.shortage import shortage_in_words
@@ -227,6 +227,7 @@ class GraspPredictor:
             rounds = {asking: rounds[asking] for asking in now}
             for together in _alike(now):
                 _take(together, [now[asking] for asking in together], progress)
+        complete_grasps([asking.done for asking in under_way if asking.done is not None and len(asking.done.rows)])
         return [asking.result() for asking in under_way]
 
     def source(self, name: str | Source, temperature: float | None = None) -> Source:

@@ -8,7 +8,7 @@ cloud. Ours.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -31,9 +31,9 @@ from dro_grasp.predict.score.holding import Evidence, gives_way, holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip_all, refine_all, score_all
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.grasp_state import GraspState, Squeeze, WeightConfig, grasp_state, pressed
-from dro_grasp.simulation.trial import hand_shift, settle
-from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
+from dro_grasp.simulation.grasp_state import GraspState, Squeeze, WeightConfig, grasp_state_many, in_turn, pressed_many
+from dro_grasp.simulation.trial import hand_shift, settle_many
+from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh_many
 
 AWAY = "push it away as they close"  # The object is lost at the first closing
 DEEP = "reach into it"  # The hand is too deep in the object, or in itself
@@ -146,7 +146,7 @@ def settle_best_all(
     problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], least: int, config: SettleConfig | None = None,
     score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
 ) -> list[SettledBest]:
-    """The same for several objects: each closes alone, the refinement and the score between are of all together."""
+    """The same for several objects of a hand, together on a device."""
     config = config or SettleConfig()
     chosen = [_better_share(*each, least, config) for each in zip(problems, batches, strict=True)]
     some = [grasps[best] for grasps, best in zip(batches, chosen, strict=True)]
@@ -213,19 +213,39 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
 def settle_all(
     problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: SettleConfig | None = None
 ) -> list[Settled]:
-    """The same for several objects: each closes alone, the refinement between is of all together."""
+    """The same for several objects of a hand, together on a device."""
     config = config or SettleConfig()
     whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
         problems, batches, strict=True)]
-    first = [None if problem.lies_flat else settle(
-        problem.hand, problem.solid, grasps, config.closing, device=str(problem.device))
-        for problem, grasps in zip(problems, whole, strict=True)]
-    hanging = [i for i, closed in enumerate(first) if closed is not None]
-    closed = [_Closed.of(problems[i], whole[i], first[i], config) for i in hanging]
-    better = dict(zip(hanging, _bettered([problems[i] for i in hanging], closed, config), strict=True))
-    moved = {i: own.moved for i, own in zip(hanging, closed, strict=True)}
-    return [_closed_again(problem, grasps, moved[i], better[i], config) if i in better else _lifted(problem, grasps, config)
+    hanging = [i for i, problem in enumerate(problems) if not problem.lies_flat]
+    done = dict(zip(hanging, _closed_thrice([problems[i] for i in hanging], [whole[i] for i in hanging], config), strict=True))
+    return [done[i] if i in done else _lifted(problem, grasps, config)
             for i, (problem, grasps) in enumerate(zip(problems, whole, strict=True))]
+
+
+def _closed_thrice(
+    problems: Sequence[GraspProblem], whole: Sequence[GraspBatch], config: SettleConfig
+) -> list[Settled]:
+    """What becomes of grasps of objects that hang in the air."""
+    if not problems:
+        return []
+    first = settle_many(problems[0].hand, [problem.solid for problem in problems], whole, config.closing,
+                        device=str(problems[0].device))
+    closed = [_Closed.of(*own, config) for own in zip(problems, whole, first, strict=True)]
+    found: dict[int, Settled] = {}
+    better = _bettered(problems, closed, config)
+    for asked, numbers in _alike(problems, config):
+        some = _closed_again(
+            [problems[i] for i in numbers], [whole[i] for i in numbers], [closed[i].moved for i in numbers],
+            [better[i] for i in numbers], asked, config)
+        found |= zip(numbers, some, strict=True)
+    return [found[i] for i in range(len(problems))]
+
+
+def _alike(problems: Sequence[GraspProblem], config: SettleConfig) -> Iterator[tuple[WeightConfig, list[int]]]:
+    """Which problems press alike, and how."""
+    asked = [weight_config(problem, config) for problem in problems]
+    yield from ((one, [i for i, other in enumerate(asked) if other == one]) for one in dict.fromkeys(asked))
 
 
 class _Closed(NamedTuple):
@@ -237,9 +257,8 @@ class _Closed(NamedTuple):
     near: Bool[Tensor, " n"]
 
     @staticmethod
-    def of(problem: GraspProblem, before: GraspBatch, after: GraspBatch | None, config: SettleConfig) -> _Closed:
+    def of(problem: GraspProblem, before: GraspBatch, after: GraspBatch, config: SettleConfig) -> _Closed:
         """What the closing showed."""
-        assert after is not None
         moved = hand_shift(problem.hand, before, after)
         return _Closed(after, moved, moved < config.still, moved < config.lost)
 
@@ -254,16 +273,20 @@ def _bettered(problems: Sequence[GraspProblem], closed: Sequence[_Closed], confi
 
 
 def _closed_again(
-    problem: GraspProblem, grasps: GraspBatch, moved: Float[Tensor, " n"], better: GraspBatch, config: SettleConfig
-) -> Settled:
+    problems: Sequence[GraspProblem], whole: Sequence[GraspBatch], moved: Sequence[Float[Tensor, " n"]],
+    better: Sequence[GraspBatch], asked: WeightConfig, config: SettleConfig,
+) -> list[Settled]:
     """What becomes of better grasps as they squeeze for the weight and close once more."""
-    hand, obj, asked = problem.hand, problem.solid, weight_config(problem, config)
-    rows = (moved < config.lost).nonzero()[:, 0]
-    done = pressed(hand, obj, problem.on_table(better[rows]), config.protocol, config=asked, device=str(problem.device))
-    better = problem.on_table(done.grasps)
-    state, squeeze = grasp_state(hand, obj, better, config.protocol, config=asked, device=str(problem.device))
-    better = better.replace(payload=done.payloads(~gives_way(state), asked.payload))
-    return _judged(problem, grasps, rows, moved, better, state, squeeze, config)
+    hand, solids, device = problems[0].hand, [problem.solid for problem in problems], str(problems[0].device)
+    rows = [(own < config.lost).nonzero()[:, 0] for own in moved]
+    near = [problem.on_table(grasps[own]) for problem, grasps, own in zip(problems, better, rows, strict=True)]
+    done, parts = pressed_many(hand, solids, near, config.protocol, config=asked, device=device), in_turn([*map(len, near)])
+    again = [problem.on_table(done.grasps[part]) for problem, part in zip(problems, parts, strict=True)]
+    state, squeeze = grasp_state_many(hand, solids, again, config.protocol, config=asked, device=device)
+    payload = done.payloads(~gives_way(state), asked.payload)
+    return [
+        _judged(problem, grasps, own, shift, found.replace(payload=payload[part]), state.rows(part), squeeze.rows(part), config)
+        for problem, grasps, own, shift, found, part in zip(problems, whole, rows, moved, again, parts, strict=True)]
 
 
 def _lifted(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig) -> Settled:
@@ -296,13 +319,30 @@ def weigh_settled(
 
     What held the object's mass as it settled carries that at least, and what gave way carries less.
     """
-    asked = weight_config(problem, settling)
-    found = weigh(
-        problem.hand, problem.solid, grasps, settling.protocol, weight=asked, config=config, device=str(problem.device))
-    if asked.pull == 0:
-        return found
-    pulled, before = asked.pull * problem.solid.mass, grasps.payload
-    return torch.where(before < pulled, found.clamp_max(LESS * pulled), found.clamp_min(pulled))
+    return weigh_settled_all([problem], [grasps], config, settling)[0]
+
+
+def weigh_settled_all(
+    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: WeighingConfig, settling: SettleConfig
+) -> list[Float[Tensor, " n"]]:
+    """The same for several objects, together where that is quicker."""
+    found: dict[int, Float[Tensor, " n"]] = {}
+    for asked, numbers in _alike(problems, settling):
+        some = weigh_many(
+            problems[0].hand, [problems[i].solid for i in numbers], [batches[i] for i in numbers], settling.protocol,
+            weight=asked, config=config, device=str(problems[0].device))
+        found |= {i: _as_observed(own, batches[i].payload, asked.pull * problems[i].solid.mass)
+                  for i, own in zip(numbers, some, strict=True)}
+    return [found[i] for i in range(len(problems))]
+
+
+def _as_observed(
+    weighed: Float[Tensor, " n"], before: Float[Tensor, " n"], pulled: float
+) -> Float[Tensor, " n"]:
+    """Weighed payloads, no less or no more than a mass that is known to have been held, or not; 0 for none [kg]."""
+    if pulled == 0:
+        return weighed
+    return torch.where(before < pulled, weighed.clamp_max(LESS * pulled), weighed.clamp_min(pulled))
 
 
 def is_jammed(hand: Hand, mass: float, squeeze: Squeeze, shortest_lever: float) -> Bool[Tensor, " n"]:

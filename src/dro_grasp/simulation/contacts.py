@@ -7,8 +7,9 @@ is Ferrari and Canny's, the least wrench that breaks the grasp.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from dro_grasp.devices import Rows
+from dro_grasp.devices import Rows, over_cores
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.hand import Hand
@@ -25,6 +26,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import PREFIX, TrialScene, scene_of
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -37,17 +40,17 @@ class Penetration(Rows):
 
 def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
     """Penetration of the collision shapes in the labelled pose, without any step of time."""
-    qpos = scene.qpos(grasps.T_object_wrist, grasps.joints)
-    depth, own = pierced(scene, qpos), np.zeros(len(grasps))
-    for i, contacts in enumerate(find_contacts(scene.model, qpos)):
+    def depths(contacts: Contacts) -> tuple[float, float]:
         inside, bodies = np.maximum(-contacts.distance, 0.0), contacts.bodies
         with_object = (bodies == scene.object_body).any(1)
-        depth[i] = inside[with_object].max(initial=depth[i])
         deepest: dict[tuple[int, int], float] = {}
         for (a, b), d in zip(np.sort(bodies[~with_object], axis=1), inside[~with_object], strict=True):
             deepest[a, b] = max(deepest.get((a, b), 0.0), float(d))
-        own[i] = sum(deepest.values())
-    return Penetration(depth, own)
+        return inside[with_object].max(initial=0.0), sum(deepest.values())
+
+    qpos = scene.qpos(grasps.T_object_wrist, grasps.joints)
+    depth, own = np.array(of_contacts(scene.model, qpos, depths)).reshape(-1, 2).T
+    return Penetration(np.maximum(depth, pierced(scene, qpos)), own)
 
 
 def deepest_penetration(
@@ -64,11 +67,12 @@ def deepest_penetration(
 def find_contact_links(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> tuple[tuple[str, ...], ...]:
     """Names of the links that touch the object in each configuration, sorted."""
     names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
-    found = []
-    for contacts in find_contacts(scene.model, qpos):
+
+    def links(contacts: Contacts) -> tuple[str, ...]:
         involved = contacts.bodies[(contacts.bodies == scene.object_body).any(1)]
-        found.append(tuple(sorted({names[i] for i in involved[involved != scene.object_body]})))
-    return tuple(found)
+        return tuple(sorted({names[i] for i in involved[involved != scene.object_body]}))
+
+    return tuple(of_contacts(scene.model, qpos, links))
 
 
 def contact_mask(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_links"]:
@@ -95,6 +99,13 @@ class Contacts:
     distance: Float[np.ndarray, " k"]  # negative inside [m]
     position: Float[np.ndarray, "k 3"]
     normal: Float[np.ndarray, "k 3"]  # from the first body to the second
+
+
+def of_contacts(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, "n nq"], work: Callable[[Contacts], Result]
+) -> list[Result]:
+    """What work makes of the contacts of each configuration."""
+    return over_cores(lambda rows: [work(contacts) for contacts in find_contacts(model, qpos[rows])], len(qpos))
 
 
 def find_contacts(model: mujoco.MjModel, qpos: Float[np.ndarray, "n nq"]) -> Iterator[Contacts]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import accumulate, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from dro_grasp.simulation.payload import PayloadConfig, Squeezes, payloads, serv
 from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.pressure import NO_ANSWER, ContactForces, Pressing, contact_forces, hardest, pressing
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts
+from dro_grasp.simulation.rollout import ObjectState, Pulls, Rollout, rollouts, rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, scene_of
 from dro_grasp.simulation.trial import held
 
@@ -109,9 +110,17 @@ def pressed(
     config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
 ) -> Pressed:
     """As `press`, with payloads only of what they are asked for."""
-    config, scene, parts = config or WeightConfig(), scene_of(hand, obj, grasps, protocol), [grasps[:0]]
-    squeezes = []
-    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
+    return pressed_many(hand, [obj], [grasps], protocol, config=config, workers=workers, device=device)
+
+
+def pressed_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
+) -> Pressed:
+    """The same for several objects, together on a device; their grasps come one batch after the other."""
+    config, parts, squeezes = config or WeightConfig(), [batches[0][:0]], []
+    scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
+    for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         joints, poses = held(part, rollout, sound)
@@ -123,8 +132,17 @@ def pressed(
             T_object_wrist=poses, joints=joints, squeeze_joints=torch.where(sound[:, None], targets, part.squeeze_joints)))
     found = GraspBatch.concatenate(parts)
     if math.isfinite(config.max_force):
-        found = _gentle(scene, found, NEARLY * config.max_force, workers, device)
+        counts = [len(grasps) for grasps in batches]
+        found = GraspBatch.concatenate([
+            _gentle(scene, found[rows], NEARLY * config.max_force, workers, device)
+            for scene, rows in zip(scenes, in_turn(counts), strict=True)])
     return Pressed(found, tuple(squeezes))
+
+
+def in_turn(counts: Sequence[int]) -> list[slice]:
+    """The rows of batches of these sizes that come one after the other."""
+    ends = list(accumulate(counts, initial=0))
+    return [slice(begin, end) for begin, end in pairwise(ends)]
 
 
 def grasp_state(
@@ -135,10 +153,19 @@ def grasp_state(
 
     Arguments and errors are those of `simulate`.
     """
-    scene, config = scene_of(hand, obj, grasps, protocol), config or WeightConfig()
+    return grasp_state_many(hand, [obj], [grasps], protocol, config=config, workers=workers, device=device)
+
+
+def grasp_state_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
+) -> tuple[GraspState, Squeeze]:
+    """The same for several objects, together on a device; their grasps come one batch after the other."""
+    scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
-    parts, squeezes = [GraspState(**none)], [Squeeze(grasps.joints[:0], grasps.joints.new_zeros(0))]
-    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
+    joints, config = batches[0].joints[:0], config or WeightConfig()
+    parts, squeezes = [GraspState(**none)], [Squeeze(joints, joints.new_zeros(0))]
+    for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
         closed, state = _observed(rollout)
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
@@ -198,7 +225,7 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     columns = {
         "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
-        "pierced": pierced(scene, rollout.qpos),
+        "pierced": np.concatenate([pierced(own, rollout.qpos[rows]) for own, rows in rollout.parts()]),
         "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
         "pressure": [c.pressure.sum() for c in found], "slip": [c.slip for c in found],
     }

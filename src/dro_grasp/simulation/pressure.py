@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from dro_grasp.devices import Rows
+from dro_grasp.devices import Rows, over_cores
 from dro_grasp.hands.hand import Hand
-from dro_grasp.simulation.rollout import Rollout, quiet
+from dro_grasp.simulation.quiet import quiet
+from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import PREFIX, TrialScene
 
 BEARS = 0.05  # Normal force of a contact above which its slip counts [N] (ours)
@@ -48,16 +49,29 @@ class ContactForces:
         return float((self.tangential[bears] / self.pressure[bears]).max()) if bears.any() else NO_ANSWER
 
 
+STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart")  # Fields of MjData on which contact forces depend
+
+
 def contact_forces(rollout: Rollout) -> list[ContactForces]:
     """The contacts with the object in each simulation, with the forces that they bear now."""
-    scene, force = rollout.scene, np.zeros(6)
-    model, data = scene.model, mujoco.MjData(scene.model)
-    names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
-    state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in names}
-    found, links = [], link_of_body(scene)
-    for i in range(rollout.size):
-        for name in names:
-            getattr(data, name)[:] = state[name][i]
+    state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in STATE}
+    found: list[ContactForces] = []
+    for scene, own in rollout.parts():
+        part, links = {name: values[own] for name, values in state.items()}, link_of_body(scene)
+        found += over_cores(
+            lambda rows, scene=scene, part=part, links=links: _forces(
+                scene, {name: values[rows] for name, values in part.items()}, links), own.stop - own.start)
+    return found
+
+
+def _forces(
+    scene: TrialScene, state: dict[str, Float[np.ndarray, "n _"]], links: Int[np.ndarray, " n_bodies"]
+) -> list[ContactForces]:
+    """Those of some simulations of a scene."""
+    model, data, force, found = scene.model, mujoco.MjData(scene.model), np.zeros(6), []
+    for i in range(len(state["qpos"])):
+        for name, values in state.items():
+            getattr(data, name)[:] = values[i]
         with quiet():
             mujoco.mj_forward(model, data)
         bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)

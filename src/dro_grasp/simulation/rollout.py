@@ -2,91 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
 from dro_grasp.devices import Rows, cores
-from dro_grasp.geometry import se3
-from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.conditions import Conditions
+from dro_grasp.simulation.joint_model import joins
 from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
-from dro_grasp.simulation.protocols import Perturbations
+from dro_grasp.simulation.quiet import quiet
+from dro_grasp.simulation.resting import RESTS, lowest_points, stands
 from dro_grasp.simulation.scene import TABLE_AWAY, TrialScene, object_mass
-from dro_grasp.simulation.worlds import STATE, WARP, on_processor, worlds
-
-FACTORS = ("friction", "mass", "gain")  # Conditions that are factors, as in Perturbations
+from dro_grasp.simulation.worlds import STATE, WARP, Share, on_processor, worlds
 
 Moment = dict[str, Float[np.ndarray, "n _"]]  # What it takes to go on from a moment, in each of n trials
-
-RESOLUTION = 1e-4  # Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise
-
-
-@dataclass(frozen=True)
-class Conditions(Rows):
-    """What differs from the protocol in n trials; the factors are those of Perturbations."""
-
-    shift: Float[np.ndarray, "n 3"]  # displacement of the object, in its own frame [m]
-    turn: Float[np.ndarray, "n 3"]  # rotation vector of the object about its centre of mass, in its own frame [rad]
-    friction: Float[np.ndarray, " n"]
-    mass: Float[np.ndarray, " n"]
-    gain: Float[np.ndarray, " n"]
-
-    def displaced(self, grasps: GraspBatch, centre_of_mass: Float[np.ndarray, "3"]) -> GraspBatch:
-        """The grasps with each object moved away from where it is expected; the hand does not know."""
-        centre = torch.from_numpy(centre_of_mass)
-        rotation = roma.rotvec_to_rotmat(torch.from_numpy(self.turn))
-        T = se3.compose(rotation, centre + torch.from_numpy(self.shift) - rotation @ centre)
-        moved = se3.invert(T) @ grasps.T_object_wrist.double()
-        return grasps.replace(T_object_wrist=moved.to(grasps.T_object_wrist.dtype))
-
-
-def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
-    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on."""
-    # A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
-    k = config.trials - 1
-    drawn = [_draw(config, k, _generator(p, q)) for p, q in zip(grasps.T_object_wrist[:, :3, 3], grasps.joints, strict=True)]
-    columns = {name: np.stack([d[name] for d in drawn], 1) for name in ("shift", "turn", *FACTORS)}
-    return Conditions(**{name: column.reshape(-1, *column.shape[2:]) for name, column in columns.items()})
-
-
-def _generator(position: Float[Tensor, "3"], joints: Float[Tensor, " n_dof"]) -> np.random.Generator:
-    content = (torch.cat([position, joints]).double() / RESOLUTION).round().long().numpy().tobytes()
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(content).digest()[:16], "big"))
-
-
-def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict[str, Float[np.ndarray, "k *_"]]:
-    """Conditions of k trials of one grasp; each factor takes one value from each of k equal parts of its range."""
-    drawn = {}
-    for name, size in (("shift", config.shift), ("turn", config.turn)):
-        direction = generator.normal(size=(k, 3))
-        drawn[name] = size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    for name in FACTORS:
-        low, high = getattr(config, name)
-        share = (generator.permutation(k) + generator.random(k)) / k
-        drawn[name] = low * (high / low) ** share
-    return drawn
-
-
 RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours
 CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
 DEVICE_CHUNK = 4096  # The same on a device. Ours: a step takes 1.6 ms for 1,024 worlds and 2.0 for 2,048 on an H100
 FEW = 64  # Fewer grasps run on the processor, which is done before a device has begun (ours)
 GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
-RESTS = 0.003  # Gap up to which an object counts as lying on a table [m]. Ours
 
 
 @dataclass(frozen=True)
@@ -127,13 +72,13 @@ class Rollout:
 
     def __init__(
         self, scene: TrialScene, grasps: GraspBatch, workers: int, stride: int | None = None,
-        conditions: Conditions | None = None, device: str = "cpu",
+        conditions: Conditions | None = None, device: str = "cpu", shares: Sequence[Share] = (),
     ) -> None:
         """Place hands and objects.
 
         Grasps, one at least, state pregrasp and squeeze if the protocol closes the hand. A frame is recorded every `stride`
         time steps, none by default; `workers` are threads, and `conditions` differ from the protocol. The device is as of
-        `worlds`.
+        `worlds`. On one that is not the processor, `shares` may be scenes of further objects, of which the grasps are in turn.
         """
         rules = scene.protocol
         start, target = grasps.joints, grasps.joints
@@ -141,22 +86,35 @@ class Rollout:
             start, target = grasps.pregrasp_joints, grasps.squeeze_joints
         self.scene, self.stride = scene, stride
         self.size = len(grasps)
-        self.mass = np.full(self.size, object_mass(scene.obj, rules))
+        self.shares = shares or (Share(scene, self.size),)
+        self.mass = self._of_object(lambda scene, rows: np.full(rows.stop - rows.start, object_mass(scene.obj, rules)))
         if conditions is not None:
-            grasps = conditions.displaced(grasps, scene.obj.centre_of_mass)
+            grasps = GraspBatch.concatenate([
+                conditions.rows(rows).displaced(grasps[rows], own.obj.centre_of_mass) for own, rows in self.parts()])
         self.device = device
-        self.batch = worlds(scene, self.size, workers, device)
+        self.batch = worlds(self.shares, workers, device)
         if conditions is not None:
             self._change(conditions)
         self.qpos, self.ctrl, self.force = (self.batch.bind(n) for n in ("qpos", "ctrl", "xfrc_applied"))
-        self.qpos[:] = scene.qpos(grasps.T_object_wrist, start)
+        self.qpos[:] = self._of_object(lambda scene, rows: scene.qpos(grasps.T_object_wrist[rows], start[rows]))
         postures = [start, grasps.joints, target] if rules.gradual else [target]
         self.targets = [joints.numpy()[:, scene.actuated] for joints in postures]
         self.ctrl[:] = self.targets[0]
         self.start = self.observe()
         if scene.table:
-            self._lay(grasps)
+            for own, rows in self.parts():
+                self._lay(own.obj, grasps[rows], rows.start)
         self.frames = [] if stride is None else [self.poses()]
+
+    def parts(self) -> Iterator[tuple[TrialScene, slice]]:
+        """Each scene, and which trials are in it."""
+        begin = 0
+        for scene, size in self.shares:
+            yield scene, slice(begin, begin + size)
+            begin += size
+
+    def _of_object(self, values: Callable[[TrialScene, slice], Float[np.ndarray, "k *_"]]) -> Float[np.ndarray, "n *_"]:
+        return np.concatenate([values(scene, rows) for scene, rows in self.parts()])
 
     @property
     def place(self) -> torch.device:
@@ -211,6 +169,19 @@ class Rollout:
         self._advance(rows, self._steps(seconds))
         return self.observe(rows)
 
+    def pulled(
+        self, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], seconds: float, begin: Moment
+    ) -> tuple[ObjectState, Moment]:
+        """What a force on each object, as of `load`, would do to some of the trials in a time [s], and the moment after it.
+
+        The trials stay as they are, so a row may come several times. The moment before is of the same rows.
+        """
+        forces = self.force[rows]
+        forces[:, self.scene.object_body, :3] = np.einsum("nij,nj->ni", self.start.rotation[rows], force)
+        with quiet():
+            after, sound = self.batch.ahead(rows, {**begin, "xfrc_applied": forces}, self._steps(seconds))
+        return self._state(after["qpos"], sound), after
+
     def make_heavy(self, mass: Float[np.ndarray, " n"]) -> None:
         """Give each object another mass [kg], and inertia in proportion; go back to a moment afterwards."""
         factor = mass / self.mass
@@ -231,16 +202,20 @@ class Rollout:
         rules = self.scene.protocol
         pulls = pulls or Pulls(rules.force, rules.force_time, rules.reset, from_start=rules.reset)
         origin = self.start if pulls.from_start else closed
-        state = {name: np.array(self.batch.bind(name)) for name in STATE} if pulls.reset else {}
+        state = self.moment() if pulls.reset else {}
+        ahead = self._pushed(np.flatnonzero(alive), pulls, state) if pulls.reset and self.spreads else None
         for k, axis in enumerate(FORCES):
             rows = np.flatnonzero(alive)
             if not len(rows):
                 break
-            for name, values in state.items():
-                self.batch.bind(name)[rows] = values[rows]
-            self._set_force(axis, pulls.acceleration, rows)
-            self._advance(rows, self._steps(pulls.seconds))
-            now = self.observe(rows)
+            if ahead is not None:
+                now = ahead.rows(k * self.size + rows)
+            else:
+                for name, values in state.items():
+                    self.batch.bind(name)[rows] = values[rows]
+                self._set_force(axis, pulls.acceleration, rows)
+                self._advance(rows, self._steps(pulls.seconds))
+                now = self.observe(rows)
             # Later columns keep these values unless the trial goes on.
             displacement[rows, k:] = now.shift(origin.rows(rows))[:, None]
             rotation[rows, k:] = now.turn(origin.rows(rows))[:, None]
@@ -248,13 +223,33 @@ class Rollout:
             alive[rows] = now.stable & (displacement[rows, k] < pulls.farthest) & (rotation[rows, k] < pulls.largest_turn)
         return displacement, rotation, stable
 
+    @property
+    def spreads(self) -> bool:
+        """Whether all directions of a pull are tried at once: a device takes as long for many trials as for few.
+
+        The processor takes one after the other, and leaves out those after the first that fails.
+        """
+        return not on_processor(self.device) and self.stride is None
+
+    def _pushed(self, rows: Int[np.ndarray, " k"], pulls: Pulls, begin: Moment) -> ObjectState:
+        """What each force does to some of the trials, from one moment on; it has as many rows for each as there are trials."""
+        everyone, many = np.tile(np.arange(self.size), len(FORCES)), np.tile(rows, len(FORCES))
+        newtons = pulls.acceleration * self.mass[many, None] * FORCES.repeat(len(rows), 0)
+        found, _ = self.pulled(many, newtons, pulls.seconds, {name: values[many] for name, values in begin.items()})
+        whole = self.observe(everyone)
+        place = (np.arange(len(FORCES))[:, None] * self.size + rows).ravel()
+        for name in ("position", "rotation", "stable"):
+            getattr(whole, name)[place] = getattr(found, name)
+        return whole
+
     def observe(self, rows: Int[np.ndarray, " k"] | None = None) -> ObjectState:
         """The object now, in some of the trials or in all."""
         rows = np.arange(self.size) if rows is None else rows
-        pose = self.qpos[rows][:, self.scene.object_qpos]
-        rotation = _matrices(pose[:, 3:])
-        unstable = self.batch.unsound[rows] | ~np.isfinite(self.qpos[rows]).all(1)
-        return ObjectState(pose[:, :3], rotation, ~unstable)
+        return self._state(self.qpos[rows], ~self.batch.unsound[rows])
+
+    def _state(self, qpos: Float[np.ndarray, "k nq"], sound: Bool[np.ndarray, " k"]) -> ObjectState:
+        pose = qpos[:, self.scene.object_qpos]
+        return ObjectState(pose[:, :3].copy(), _matrices(pose[:, 3:]), sound & np.isfinite(qpos).all(1))
 
     def poses(self) -> tuple[Float[np.ndarray, "n n_dof"], Float[np.ndarray, "n 4 4"]]:
         """Independent joints [rad or m] and object poses in the wrist frame [m] now."""
@@ -266,11 +261,12 @@ class Rollout:
         pose = self.qpos[:, self.scene.object_qpos]
         poses = np.tile(np.eye(4), (self.size, 1, 1))
         rotation = _matrices(pose[:, 3:])
-        poses[:, :3, :3], poses[:, :3, 3] = rotation, pose[:, :3] - rotation @ self.scene.obj.centre_of_mass
+        from_centre = self._of_object(lambda scene, rows: rotation[rows] @ scene.obj.centre_of_mass)
+        poses[:, :3, :3], poses[:, :3, 3] = rotation, pose[:, :3] - from_centre
         return joints, poses
 
-    def _lay(self, grasps: GraspBatch) -> None:
-        """Put each table where the object lies on it, and the object's weight on the table."""
+    def _lay(self, obj: ObjectModel, grasps: GraspBatch, begin: int) -> None:
+        """Put each table where an object lies on it, and its weight on the table, in the trials from one on."""
         # An object that stands elsewhere than the hand expects takes the table along.
         found = table_planes(grasps)
         if found is None:
@@ -278,15 +274,16 @@ class Rollout:
         planes, T = found.double().numpy(), grasps.T_object_wrist.double().numpy()
         laid = np.flatnonzero(np.isfinite(planes).all(1))
         up, level, rotation = planes[laid, :3], planes[laid, 3], T[laid, :3, :3]
-        lowest = lowest_points(self.scene.obj, up)
+        lowest = lowest_points(obj, up)
         height = np.minimum(level, lowest) - np.einsum("ni,ni->n", up, T[laid, :3, 3])
         normal = np.einsum("nij,ni->nj", rotation, up)
         turned = np.zeros((len(laid), 4))
         for quaternion, direction in zip(turned, normal, strict=True):
             mujoco.mju_quatZ2Vec(quaternion, direction)
+        rests = (lowest - level < RESTS) & stands(obj, up)
+        laid = laid + begin
         self.batch.bind("mocap_pos")[laid, 0] = height[:, None] * normal
         self.batch.bind("mocap_quat")[laid, 0] = turned
-        rests = (lowest - level < RESTS) & stands(self.scene.obj, up)
         weight = GRAVITY * self.mass[laid] * rests
         self.force[laid, self.scene.object_body, :3] = -weight[:, None] * normal
 
@@ -318,75 +315,52 @@ class Rollout:
                     self.frames.append(self.poses())
 
 
-def lowest_points(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """How far the lowest point of an object, as it collides, is along each upward direction [m]."""
-    if obj.balls is not None:
-        return (up @ obj.balls.centres.double().numpy().T - obj.balls.radii.double().numpy()).min(1)
-    return (up @ np.concatenate([vertices for vertices, _ in obj.parts]).T).min(1)
-
-
-def stands(obj: ObjectModel, up: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Whether an estimated object stands on its lowest points, for each upward direction; what is known may fall over.
-
-    A camera sees things at rest. Where the estimate of one has its lowest points to one side, that is an error of the estimate.
-    """
-    if obj.balls is None:
-        return np.ones(len(up), bool)
-    centres, radii = obj.balls.centres.double().numpy(), obj.balls.radii.double().numpy()
-    heights = up @ centres.T - radii
-    low = heights < heights.min(1, keepdims=True) + RESTS
-    # The centre of mass is above the hull of what carries it if no half of the directions around it is empty.
-    across = np.linalg.svd(up[:, None])[2][:, 1:]
-    x, y = np.einsum("nsk,bk->snb", across, centres - obj.centre_of_mass)
-    angles = np.where(low, np.arctan2(y, x), np.nan)
-    angles = np.sort(np.where(low, angles, np.nanmax(angles, 1, keepdims=True)), 1)
-    gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * math.pi)
-    return gaps.max(1) < math.pi
-
-
 def rollouts(
     scene: TrialScene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None, device: str = "cpu"
 ) -> Iterator[tuple[GraspBatch, Rollout]]:
     """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
-    if len(grasps) < FEW and device != WARP:
-        device = "cpu"
-    centre = torch.as_tensor(scene.obj.centre_of_mass)
-    for part in grasps.in_parts(CHUNK if on_processor(device) else DEVICE_CHUNK):
-        if scene.protocol.closing:
-            part = complete(hand, part, centre, scene.protocol.controller)
-        yield part, Rollout(scene, part, workers or cores(), stride, device=device)
+    yield from rollouts_of_all([scene], hand, [grasps], workers, stride, device)
 
 
-class _Quiet:
-    """MuJoCo's handler of warnings, which is the process's: the first block sets it, the last that ends gives it back."""
-
-    def __init__(self) -> None:
-        self._lock, self._blocks, self._before = threading.Lock(), 0, None
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._blocks == 0:
-                self._before = mujoco.get_mju_user_warning()
-                mujoco.set_mju_user_warning(_ignore)
-            self._blocks += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._blocks -= 1
-            if self._blocks == 0:
-                mujoco.set_mju_user_warning(self._before)
-
-
-_QUIET = _Quiet()  # The only one
-
-
-def quiet() -> _Quiet:
-    """A block in which MuJoCo writes no warnings to the terminal or to a log in the working folder, in any thread."""
-    return _QUIET
+def rollouts_of_all(
+    scenes: Sequence[TrialScene], hand: Hand, batches: Sequence[GraspBatch], workers: int | None, stride: int | None = None,
+    device: str = "cpu",
+) -> Iterator[tuple[GraspBatch, Rollout]]:
+    """The same for several objects of a hand, in their order; on a device, those that join are simulated together."""
+    for numbers in _groups(scenes, [len(grasps) for grasps in batches], device):
+        count = sum(len(batches[i]) for i in numbers)
+        where = "cpu" if count < FEW and device != WARP else device
+        if on_processor(where):
+            for i in numbers:
+                for part in batches[i].in_parts(CHUNK):
+                    part = _ready(scenes[i], hand, part)
+                    yield part, Rollout(scenes[i], part, workers or cores(), stride, device=where)
+            continue
+        own = [_ready(scenes[i], hand, batches[i]) for i in numbers]
+        of = np.repeat(numbers, [len(grasps) for grasps in own])
+        whole = own[0] if len(own) == 1 else GraspBatch.concatenate(own)
+        for begin in range(0, count, DEVICE_CHUNK):
+            rows = slice(begin, begin + DEVICE_CHUNK)
+            shares = [Share(scenes[i], len(list(same))) for i, same in groupby(of[rows].tolist())]
+            yield whole[rows], Rollout(shares[0].scene, whole[rows], workers or cores(), stride, device=where, shares=shares)
 
 
-def _ignore(message: str) -> None:
-    """Each trial counts its warnings; their text adds nothing."""
+def _groups(scenes: Sequence[TrialScene], counts: Sequence[int], device: str) -> list[list[int]]:
+    """Numbers of scenes that are simulated together, without those that have no grasps."""
+    groups: list[list[int]] = []
+    for i in np.flatnonzero(counts).tolist():
+        if groups and not on_processor(device) and joins(scenes[groups[-1][-1]], scenes[i]):
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return groups
+
+
+def _ready(scene: TrialScene, hand: Hand, grasps: GraspBatch) -> GraspBatch:
+    """The grasps with pregrasp and squeeze, if the hand closes."""
+    if not scene.protocol.closing:
+        return grasps
+    return complete(hand, grasps, torch.as_tensor(scene.obj.centre_of_mass), scene.protocol.controller)
 
 
 def _matrices(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:

@@ -6,8 +6,10 @@ The hand's root is fixed at the origin; the object's free joint takes the invers
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -136,7 +138,7 @@ FAR_AWAY = (0.0, 0.0, 5.0)  # Place of the object until a grasp is written [m]. 
 MEMORY = 64 << 20  # Of the contacts of a simulation [bytes]. Ours: 340 with balls of a cloud overflow 15 MiB, MuJoCo's default
 TABLE_AWAY = (0.0, 0.0, -10.0)  # Place of a table while there is none [m]. Ours
 OBJECT_GROUP = 1  # Group of the object's geoms, and of nothing else, by which rays find them
-CACHED_SCENES = 8  # Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols
+CACHED_SCENES = 64  # Scenes that `cached_scene` keeps. Ours: those of many objects under two protocols; 8 MB each of Shadow
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,10 +232,18 @@ def require_simulable(hand: Hand, obj: ObjectModel) -> None:
 def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = False) -> TrialScene:
     """Put a hand and an object, and perhaps a table, into one model; errors are those of `require_simulable`."""
     require_simulable(hand, obj)
+    model = compiled(hand, protocol, table, lambda scene: add_object(scene, obj, protocol))
+    return TrialScene(model, hand, obj, protocol, table)
+
+
+def compiled(
+    hand: Hand, protocol: Protocol, table: bool, add: Callable[[mujoco.MjSpec], mujoco.MjsBody]
+) -> mujoco.MjModel:
+    """The model of a hand, of the body `object` that is added, and perhaps of a table."""
     scene = _empty_scene(protocol)
     attach(scene, hand_spec(hand, protocol), scene.worldbody.add_frame())
     add_servos(scene, hand, protocol)
-    add_object(scene, obj, protocol)
+    add(scene)
     if table:
         _add_table(scene, protocol)
     with warnings.catch_warnings():
@@ -243,7 +253,7 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol, table: bool = 
             scene.add_exclude(bodyname1=first, bodyname2=second)
         model = scene.compile()
     model.geom_group[:] = np.where(model.geom_bodyid == model.body("object").id, OBJECT_GROUP, 0)
-    return TrialScene(model, hand, obj, protocol, table)
+    return model
 
 
 def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
@@ -264,24 +274,37 @@ def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name:
     # The body's frame is at the centre of mass: MuJoCo integrates its origin, which errs where a body turns about another
     # point.
     body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
-    middle = obj.centre_of_mass
     body.add_freejoint(name=name)
-    touch = {"condim": 4, "mass": 0.0, "friction": [protocol.friction, protocol.torsional_friction, 1e-4]}
     if obj.balls is not None:
-        for centre, radius in zip((obj.balls.centres.numpy() - middle).tolist(), obj.balls.radii.tolist(), strict=True):
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre, **touch)
-    for i, (vertices, faces) in enumerate(obj.parts if obj.balls is None else ()):
-        mesh = scene.add_mesh(name=f"{name}{i}", uservert=(np.asarray(vertices, float) - middle).ravel(),
-                              userface=np.asarray(faces, np.int32).ravel())
-        mesh.maxhullvert = HULL_VERTICES
-        # A part's own inertia plays no role, and thin parts would be refused for it.
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **touch)
+        centres = obj.balls.centres.numpy() - obj.centre_of_mass
+        for centre, radius in zip(centres.tolist(), obj.balls.radii.tolist(), strict=True):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre, **touching(protocol))
+    else:
+        for mesh in add_parts(scene, obj, name):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, **touching(protocol))
     mass = object_mass(obj, protocol)
     inertia = obj.inertia / obj.volume * mass
     body.explicitinertial, body.mass, body.ipos = True, mass, [0, 0, 0]
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     return body
+
+
+def add_parts(scene: mujoco.MjSpec, obj: ObjectModel, name: str) -> list[str]:
+    """Meshes of an object's convex parts, about its centre of mass; their names begin with the given one."""
+    names = []
+    for i, (vertices, faces) in enumerate(obj.parts):
+        mesh = scene.add_mesh(name=f"{name}{i}", uservert=(np.asarray(vertices, float) - obj.centre_of_mass).ravel(),
+                              userface=np.asarray(faces, np.int32).ravel())
+        mesh.maxhullvert = HULL_VERTICES
+        # A part's own inertia plays no role, and thin parts would be refused for it.
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        names.append(mesh.name)
+    return names
+
+
+def touching(protocol: Protocol) -> dict[str, Any]:
+    """How each shape of an object touches."""
+    return {"condim": 4, "mass": 0.0, "friction": [protocol.friction, protocol.torsional_friction, 1e-4]}
 
 
 def _add_table(scene: mujoco.MjSpec, protocol: Protocol) -> None:

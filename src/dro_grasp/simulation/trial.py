@@ -5,7 +5,7 @@ Source: paper, evaluation metric details.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +19,12 @@ from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.conditions import draw
 from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, draw, rollouts
+from dro_grasp.simulation.rollout import Rollout, rollouts, rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
 from dro_grasp.simulation.worlds import on_processor
 
@@ -159,14 +160,24 @@ def settle(
     grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
     outcomes are dropped. Errors are those of `simulate`.
     """
-    scene = scene_of(hand, obj, grasps, protocol)
-    joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
-    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
+    return settle_many(hand, [obj], [grasps], protocol, workers=workers, device=device)[0]
+
+
+def settle_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    workers: int | None = None, device: str = "cpu"
+) -> list[GraspBatch]:
+    """The same for several objects, together on a device."""
+    scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
+    joints, poses = [batches[0].joints[:0]], [batches[0].T_object_wrist[:0]]
+    for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
         held_joints, T_object_wrist = held(part, rollout, torch.from_numpy(rollout.close().stable))
         joints.append(held_joints)
         poses.append(T_object_wrist)
-    unsettled = grasps.without(*PER_JOINT, *CARRYING, "score").without_trial()
-    return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+    counts = [len(grasps) for grasps in batches]
+    return [
+        grasps.without(*PER_JOINT, *CARRYING, "score").without_trial().replace(T_object_wrist=T, joints=q)
+        for grasps, T, q in zip(batches, torch.cat(poses).split(counts), torch.cat(joints).split(counts), strict=True)]
 
 
 def held(
@@ -175,7 +186,8 @@ def held(
     """Labels of closed hands, as of `settle`: joints and wrist poses; those of the grasp where the closing is not sound."""
     hand = rollout.scene.hand
     reached, T_object_wrist = _reached(part, rollout, hand, sound)
-    touching = contact_mask(hand, find_contact_links(rollout.scene, rollout.qpos))
+    touching = contact_mask(hand, [
+        links for scene, rows in rollout.parts() for links in find_contact_links(scene, rollout.qpos[rows])])
     holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
     return torch.where(holding, reached, part.joints), T_object_wrist
 

@@ -1,4 +1,4 @@
-"""Simulations on a device by MuJoCo Warp: thousands of worlds of one scene, in single precision.
+"""Simulations on a device by MuJoCo Warp: thousands of worlds of one hand and several objects, in single precision.
 
 What a rollout reads and writes stays on the processor. For each call of `step`, the state of the worlds goes to the device and
 what became of it comes back, so worlds that do not step keep theirs. That is a thousandth of the time that the steps take.
@@ -7,20 +7,21 @@ what became of it comes back, so worlds that do not step keep theirs. That is a 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields as fields_of, replace
 from functools import cache, lru_cache
 from types import ModuleType
 from typing import Any
 
 import mujoco
+import mujoco.batch
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from dro_grasp.extras import require_extra
-from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene
-from dro_grasp.simulation.worlds import STATE, WARP, ProcessorWorlds
+from dro_grasp.simulation.joint_model import JointModel, joint_model
+from dro_grasp.simulation.worlds import INPUTS, STATE, WARP, Ahead, ProcessorWorlds, Share, Values
 
-INPUTS = (*STATE, "ctrl", "xfrc_applied", "mocap_pos", "mocap_quat")  # Fields of MjData that steps depend on
 MOST = 4096  # Worlds that step together. Ours: with 16,384, an H100 has no memory for 128 contacts each
 FEWEST = 128  # Worlds of the smallest graph; others have powers of two. Ours: fewer are no faster
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
@@ -42,38 +43,95 @@ class Room:
 
 
 class WarpWorlds:
-    """Worlds on a device, and on the processor the same ones for what is read and written, and for those that overflow."""
+    """Worlds on a device; those that overflow step on the processor."""
 
-    def __init__(self, scene: TrialScene, own: ProcessorWorlds, device: str) -> None:
+    def __init__(self, shares: Sequence[Share], workers: int, device: str) -> None:
         _modules()
-        self._scene, self._own, self._device = scene, own, "cpu" if device == WARP else device
-        self._exploded = np.zeros(len(own.bind("qpos")), bool)
-        self.bind, self.expand, self.set_const = own.bind, own.expand, own.set_const
+        scenes = tuple(dict.fromkeys(share.scene for share in shares))
+        self._joint, self._workers, self._device = joint_model(scenes), workers, "cpu" if device == WARP else device
+        self._scene = np.concatenate([np.full(share.size, scenes.index(share.scene)) for share in shares])
+        data, size = mujoco.MjData(self._joint.model), len(self._scene)
+        self._data = {name: np.repeat(getattr(data, name)[None], size, 0) for name in INPUTS}
+        self._fields = {name: values[self._scene] for name, values in self._joint.fields.items()}
+        self._written: set[str] = set()  # Fields that the caller asked for
+        self._version, self.unsound = object(), np.zeros(size, bool)
 
-    @property
-    def unsound(self) -> Bool[np.ndarray, " n"]:
+    def bind(self, name: str) -> Float[np.ndarray, "n *_"]:
         """As of `Worlds`."""
-        return self._own.unsound | self._exploded
+        return self._data[name]
+
+    def expand(self, name: str) -> Float[np.ndarray, "n *_"]:
+        """As of `Worlds`."""
+        if name not in self._fields:
+            self._fields[name] = np.repeat(getattr(self._joint.model, name)[None], len(self._scene), 0)
+        self._written.add(name)
+        return self._fields[name]
+
+    def set_const(self) -> None:
+        """As of `Worlds`."""
+        for number in np.unique(self._scene):
+            rows = np.flatnonzero(self._scene == number)
+            own = self._on_processor(number, rows)
+            own.set_const()
+            for name, values in own.expanded(mujoco.batch.MODEL_FIELDS).items():
+                self.expand(name)[self._place(name, number, rows)] = values
+        self._version = object()
 
     def step(self, rows: Int[np.ndarray, " k"], count: int) -> None:
         """As of `Worlds`."""
         rows = rows[~self.unsound[rows]]
-        for begin in range(0, len(rows), MOST):
-            self._step(rows[begin:begin + MOST], count)
+        state, sound = self.ahead(rows, {}, count)
+        for name, values in state.items():
+            self._data[name][rows[sound]] = values[sound]
+        self.unsound[rows[~sound]] = True
 
-    def _step(self, rows: Int[np.ndarray, " k"], count: int) -> None:
-        fields = {name: values for name, values in self._own.expanded().items() if name in _batched()}
-        graphs = _graphs(self._scene, self._device, tuple(sorted(fields)))
-        inputs = {name: self.bind(name)[rows] for name in INPUTS}
-        after, missed = graphs.step(inputs, {name: values[rows] for name, values in fields.items()}, count)
-        fits = ~missed
+    def ahead(self, rows: Int[np.ndarray, " k"], given: Values, count: int) -> Ahead:
+        """As of `Worlds`."""
+        inputs = {name: given[name] if name in given else self._data[name][rows] for name in INPUTS}
+        state, sound = {name: np.array(inputs[name]) for name in STATE}, ~self.unsound[rows]
+        going = np.flatnonzero(sound)
+        for begin in range(0, len(going), MOST):
+            part = going[begin:begin + MOST]
+            found = self._ahead(rows[part], {name: values[part] for name, values in inputs.items()}, count)
+            sound[part] = found.sound
+            for name, values in found.state.items():
+                state[name][part] = values
+        return Ahead(state, sound)
+
+    def _ahead(self, rows: Int[np.ndarray, " k"], inputs: Values, count: int) -> Ahead:
+        names = sorted(self._fields.keys() & _batched())
+        graphs = _graphs(self._joint, self._device, tuple(names))
+        fields = Fields((self._version, rows.tobytes()), lambda: {name: self._fields[name][rows] for name in names})
+        state, missed = graphs.step(inputs, fields, count)
         with np.errstate(invalid="ignore"):
-            sane = np.all([(np.abs(values) < LARGEST).all(1) for values in after.values()], 0)
-        self._exploded[rows[fits & ~sane]] = True
-        for name, values in after.items():
-            self.bind(name)[rows[fits]] = values[fits]
-        if missed.any():
-            self._own.step(rows[missed], count)
+            sound = np.all([(np.abs(values) < LARGEST).all(1) for values in state.values()], 0)
+        for number in np.unique(self._scene[rows[missed]]):
+            part = np.flatnonzero(missed & (self._scene[rows] == number))
+            own = self._on_processor(number, rows[part]).ahead(
+                np.arange(len(part)), {name: values[part] for name, values in inputs.items()}, count)
+            sound[part] = own.sound
+            for name, values in own.state.items():
+                state[name][part] = values
+        return Ahead(state, sound)
+
+    def _on_processor(self, number: int, rows: Int[np.ndarray, " k"]) -> ProcessorWorlds:
+        """Worlds of a scene as simulations of that scene alone, with the fields that were written."""
+        own = ProcessorWorlds(self._joint.scenes[number], len(rows), self._workers)
+        for name in self._written:
+            own.expand(name)[:] = self._fields[name][self._place(name, number, rows)]
+        return own
+
+    def _place(self, name: str, number: int, rows: Int[np.ndarray, " k"]) -> Any:
+        """Where the values of a scene are, for some of its worlds."""
+        return np.ix_(rows, self._joint.shapes[number]) if name.startswith("geom_") else rows
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Fields of the model by world, and a key that tells whether they are those of the last call."""
+
+    key: object
+    values: Callable[[], dict[str, Num[np.ndarray, "k *_"]]]
 
 
 _ROOMS: dict[str, Room] = {}
@@ -81,22 +139,20 @@ _ROOMS: dict[str, Room] = {}
 
 
 class _Graphs:
-    """Steps of one scene on one device, for several numbers of worlds."""
+    """Steps of one model on one device, for several numbers of worlds."""
 
-    def __init__(self, scene: TrialScene, device: str, fields: tuple[str, ...]) -> None:
-        self._scene, self._device, self._fields = scene, device, fields
+    def __init__(self, joint: JointModel, device: str, fields: tuple[str, ...]) -> None:
+        self._joint, self._device, self._fields = joint, device, fields
         self._lock, self._number = threading.Lock(), 0
 
-    def step(
-        self, inputs: dict[str, Float[np.ndarray, "k *_"]], fields: dict[str, Float[np.ndarray, "k *_"]], count: int
-    ) -> tuple[dict[str, Float[np.ndarray, "k _"]], Bool[np.ndarray, " k"]]:
+    def step(self, inputs: Values, fields: Fields, count: int) -> tuple[Values, Bool[np.ndarray, " k"]]:
         """What becomes of the worlds, and which of them had no room; the room grows where those are many."""
         worlds = len(inputs["qpos"])
         with self._lock:
             number = self.number(worlds)
             while True:
-                room = _ROOMS.get(hand := self._scene.hand.sha256, Room())
-                graph = _graph(self._scene, self._device, self._fields, number, room)
+                room = _ROOMS.get(hand := self._joint.scenes[0].hand.sha256, Room())
+                graph = _graph(self._joint, self._device, self._fields, number, room)
                 after, overflow = graph.step(inputs, fields, count)
                 _ROOMS[hand] = _larger(room, overflow[:worlds])
                 if _ROOMS[hand] == room:
@@ -132,6 +188,8 @@ class _Graph:
             self._data = self._mjw.put_data(
                 model, mujoco.MjData(model), nworld=number, nconmax=room.contacts, njmax=room.rows)
             self._graph = self._captured() if self._device.is_cuda else None
+        self._key: object = None
+        self._shapes = {name: getattr(self._model, name).numpy().shape for name in fields}
 
     def _captured(self) -> Any:
         self._mjw.step(self._model, self._data)  # compiles, which a capture cannot
@@ -139,20 +197,26 @@ class _Graph:
             self._mjw.step(self._model, self._data)
         return capture.graph
 
-    def step(
-        self, inputs: dict[str, Float[np.ndarray, "k *_"]], fields: dict[str, Float[np.ndarray, "k *_"]], count: int
-    ) -> tuple[dict[str, Float[np.ndarray, "n _"]], Int[np.ndarray, " n"]]:
+    def step(self, inputs: Values, fields: Fields, count: int) -> tuple[Values, Int[np.ndarray, " n"]]:
         """State and overflows of all worlds after some steps; worlds beyond the k repeat them."""
         rows = np.resize(np.arange(len(inputs["qpos"])), self._data.nworld)
         with self._wp.ScopedDevice(self._device):
-            for record, values in ((self._data, inputs), (self._model, fields)):
-                for name, own in values.items():
-                    getattr(record, name).assign(own[rows].astype(np.float32))
+            for name, own in inputs.items():
+                getattr(self._data, name).assign(own[rows].astype(np.float32))
+            if fields.key != self._key:
+                for name, own in fields.values().items():
+                    self._write(name, own[rows])
+                self._key = fields.key
             self._data.overflow.zero_()
             for _ in range(count):
                 self._step()
             after = {name: getattr(self._data, name).numpy().astype(np.float64) for name in STATE}
             return after, self._data.overflow.numpy() & int(_counted())
+
+    def _write(self, name: str, values: Num[np.ndarray, "n *_"]) -> None:
+        """Give a field of the model a value in each world."""
+        kind = np.int32 if np.issubdtype(values.dtype, np.integer) else np.float32
+        getattr(self._model, name).assign(values.astype(kind).reshape(self._shapes[name]))
 
     def _step(self) -> None:
         if self._graph is None:
@@ -161,14 +225,14 @@ class _Graph:
             self._wp.capture_launch(self._graph)
 
 
-@lru_cache(maxsize=CACHED_SCENES)
-def _graphs(scene: TrialScene, device: str, fields: tuple[str, ...]) -> _Graphs:
-    return _Graphs(scene, device, fields)
+@lru_cache(maxsize=CACHED)
+def _graphs(joint: JointModel, device: str, fields: tuple[str, ...]) -> _Graphs:
+    return _Graphs(joint, device, fields)
 
 
 @lru_cache(maxsize=CACHED)
-def _graph(scene: TrialScene, device: str, fields: tuple[str, ...], number: int, room: Room) -> _Graph:
-    return _Graph(scene.model, device, number, fields, room)
+def _graph(joint: JointModel, device: str, fields: tuple[str, ...], number: int, room: Room) -> _Graph:
+    return _Graph(joint.model, device, number, fields, room)
 
 
 @cache

@@ -7,6 +7,7 @@ would, for a fifth of the time of a trial. How fast it moves then tells what it 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.payload import GRAVITY, Squeezes
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.rollout import Moment, ObjectState, Rollout, rollouts
+from dro_grasp.simulation.rollout import Moment, ObjectState, Rollout, rollouts_of_all
 from dro_grasp.simulation.scene import scene_of
 
 LESS = 0.95  # Share of a mass that gave way, which its grasp may still carry (ours)
@@ -66,18 +67,28 @@ def weigh(
         workers: Threads; all cores by default.
         device: As of `simulate`.
     """
-    weight, config, found = weight or WeightConfig(), config or WeighingConfig(), grasps.payload.clone()
-    rows = found.isfinite().nonzero()[:, 0]
-    begin = 0
-    for part, rollout in rollouts(
-            scene_of(hand, obj, grasps, protocol), hand, grasps[rows], workers, device=device):
+    return weigh_many(
+        hand, [obj], [grasps], protocol, weight=weight, config=config, workers=workers, device=device)[0]
+
+
+def weigh_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None, device: str = "cpu",
+) -> list[Float[Tensor, " n"]]:
+    """The same for several objects, together on a device."""
+    weight, config = weight or WeightConfig(), config or WeighingConfig()
+    scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
+    found = torch.cat([grasps.payload for grasps in batches])
+    rows, begin = found.isfinite().nonzero()[:, 0], 0
+    some = [grasps[grasps.payload.isfinite().nonzero()[:, 0]] for grasps in batches]
+    for part, rollout in rollouts_of_all(scenes, hand, some, workers, device=device):
         rollout.close()
         joints = torch.from_numpy(rollout.poses()[0]).to(part.joints)
         chosen = squeezes_of(hand, contact_forces(rollout), joints, part.squeeze_joints, weight, rollout.place)
         made_for = torch.from_numpy(rollout.mass).to(joints)
         found[rows[begin:begin + len(part)]] = weighed(rollout, chosen, part.payload, weight, config, made_for)
         begin += len(part)
-    return found
+    return list(found.split([len(grasps) for grasps in batches]))
 
 
 def observed(
@@ -161,29 +172,50 @@ def _pull(
     """
     begin, held = rollout.moment(), np.ones(len(mass), bool)
     order = np.argsort(-tried.used, 1, kind="stable")
+    ahead = _all_used(rollout, mass, tried, begin, config) if rollout.spreads else None
     for k in range(order.shape[1]):
         axis = order[:, k]
         known = tried.held[np.arange(len(mass)), axis] >= mass
         rows = np.flatnonzero((held | thorough) & ~known)
         if not len(rows):
             continue
-        used = _used(rollout, rows, GRAVITY * mass[rows, None] * FORCES[axis[rows]], begin, config)
+        if ahead is not None:
+            used = ahead[rows, axis[rows]]
+        else:
+            force = GRAVITY * mass[rows, None] * FORCES[axis[rows]]
+            used = _used(rollout, rows, config, lambda some, now, rows=rows, force=force: (
+                rollout.pull(rows[some], force[some], config.pulling / 2, begin if now is None else None), begin))
         tried.used[rows, axis[rows]] = used
         tried.held[rows, axis[rows]] = np.where(used < 1, mass[rows], tried.held[rows, axis[rows]])
         held[rows] &= used < 1
     return held
 
 
-def _used(
-    rollout: Rollout, rows: Int[np.ndarray, " k"], force: Float[np.ndarray, "k 3"], begin: Moment, config: WeighingConfig
-) -> Float[np.ndarray, " k"]:
-    """Share of what the protocol lets an object move that a force [N] uses."""
-    start, half = rollout.start.rows(rows), rollout.pull(rows, force, config.pulling / 2, begin)
+def _all_used(
+    rollout: Rollout, mass: Float[np.ndarray, " n"], tried: _Tried, begin: Moment, config: WeighingConfig
+) -> Float[np.ndarray, "n 6"]:
+    """What each mass uses in each direction, found at once; NaN where it is known to be held."""
+    rows, axis = np.nonzero(tried.held < mass[:, None])
+    force, used = GRAVITY * mass[rows, None] * FORCES[axis], np.full(tried.held.shape, np.nan)
+    used[rows, axis] = _used(rollout, rows, config, lambda some, now: rollout.pulled(
+        rows[some], force[some], config.pulling / 2,
+        {name: values[rows[some]] if now is None else values[some] for name, values in (now or begin).items()}))
+    return used
+
+
+Pull = Callable[[Int[np.ndarray, " k"], Moment | None], tuple[ObjectState, Moment]]
+"""Pulls for half of the time at some of the trials, from the closed hands or from a moment; what comes of it."""
+
+
+def _used(rollout: Rollout, rows: Int[np.ndarray, " k"], config: WeighingConfig, pull: Pull) -> Float[np.ndarray, " k"]:
+    """Share of what the protocol lets an object move that a force uses."""
+    start = rollout.start.rows(rows)
+    half, moment = pull(np.arange(len(rows)), None)
     used = _share(rollout, half, half.shift(start), half.turn(start))
     going = np.flatnonzero(used < 1)  # what has gone too far already is not pulled on
     if not len(going):
         return used
-    before, now = half.rows(going), rollout.pull(rows[going], force[going], config.pulling / 2)
+    before, now = half.rows(going), pull(going, moment)[0]
     share, start = config.going_on / (config.pulling / 2), start.rows(going)
     moved, turned = (
         after + share * np.maximum(after - then, 0)

@@ -1,8 +1,9 @@
-"""Simulations of one scene side by side, as a rollout needs them: MuJoCo's on the processor, MuJoCo Warp's on a device."""
+"""Simulations side by side, as a rollout needs them: MuJoCo's on the processor, MuJoCo Warp's on a device."""
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Collection, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import mujoco.batch
@@ -12,12 +13,30 @@ from jaxtyping import Bool, Float, Int
 from dro_grasp.simulation.scene import TrialScene
 
 STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a simulation needs to continue from an earlier moment
+INPUTS = (*STATE, "ctrl", "xfrc_applied", "mocap_pos", "mocap_quat")  # Fields of MjData that steps depend on
 WARP = "warp"  # In place of a device: MuJoCo Warp on the processor, which is slow and shows what a device would do
+
+
+Values = dict[str, Float[np.ndarray, "k *_"]]  # Fields of k simulations
+
+
+class Share(NamedTuple):
+    """A scene, and how many simulations in a row are of it."""
+
+    scene: TrialScene
+    size: int
+
+
+class Ahead(NamedTuple):
+    """What would become of k simulations."""
+
+    state: Values  # their STATE
+    sound: Bool[np.ndarray, " k"]
 
 
 @runtime_checkable
 class Worlds(Protocol):
-    """Simulations of one scene; arrays have a row for each and are written in place."""
+    """Simulations; arrays have a row for each and are written in place."""
 
     def bind(self, name: str) -> Float[np.ndarray, "n *_"]:
         """A field of MjData in all simulations."""
@@ -28,11 +47,18 @@ class Worlds(Protocol):
         ...
 
     def set_const(self) -> None:
-        """Derive what follows from masses, after they were written."""
+        """Derive what follows from masses; it ends every change of the fields of MjModel."""
         ...
 
     def step(self, rows: Int[np.ndarray, " k"], count: int) -> None:
         """Take some of the simulations this many time steps further; the others stay as they are."""
+        ...
+
+    def ahead(self, rows: Int[np.ndarray, " k"], given: Values, count: int) -> Ahead:
+        """What so many time steps would make of some of the simulations if they had these INPUTS; all stay as they are.
+
+        A row may come several times, as for several forces.
+        """
         ...
 
     @property
@@ -41,14 +67,14 @@ class Worlds(Protocol):
         ...
 
 
-def worlds(scene: TrialScene, size: int, workers: int, device: str) -> Worlds:
-    """That many simulations of a scene, on a device; see `on_processor` for which devices have none."""
-    own = ProcessorWorlds(scene, size, workers)
+def worlds(shares: Sequence[Share], workers: int, device: str) -> Worlds:
+    """Simulations on a device; those of several scenes, which must be of one hand, only where `on_processor` is false."""
     if on_processor(device):
-        return own
+        (scene, size), = shares
+        return ProcessorWorlds(scene, size, workers)
     from dro_grasp.simulation.warp_worlds import WarpWorlds  # it needs an extra
 
-    return WarpWorlds(scene, own, device)
+    return WarpWorlds(shares, workers, device)
 
 
 def on_processor(device: str) -> bool:
@@ -57,9 +83,10 @@ def on_processor(device: str) -> bool:
 
 
 class ProcessorWorlds:
-    """MuJoCo's batch of simulations."""
+    """MuJoCo's batch of simulations of one scene."""
 
     def __init__(self, scene: TrialScene, size: int, workers: int) -> None:
+        self._scene, self._workers = scene, workers
         self._batch = mujoco.batch.Batch(scene.model, nsim=size, nthread=min(workers, size))
         self._overflowed = np.zeros(size, bool)
         self.bind, self.expand, self.set_const = self._batch.bind, self._batch.expand, self._batch.set_const
@@ -77,7 +104,17 @@ class ProcessorWorlds:
         except mujoco.batch.SimulationError as error:  # more contacts than fit into memory; the others went on
             self._overflowed[error.ids] = True
 
-    def expanded(self) -> dict[str, Float[np.ndarray, "n *_"]]:
-        """The fields of the model that have a value of their own in each simulation."""
-        found = {name: self._batch.expanded(name) for name in mujoco.batch.MODEL_FIELDS}
+    def ahead(self, rows: Int[np.ndarray, " k"], given: Values, count: int) -> Ahead:
+        """As of `Worlds`."""
+        others = ProcessorWorlds(self._scene, len(rows), self._workers)
+        for name in INPUTS:
+            others.bind(name)[:] = given[name] if name in given else self.bind(name)[rows]
+        for name, values in self.expanded(mujoco.batch.MODEL_FIELDS).items():
+            others.expand(name)[:] = values[rows]
+        others.step(np.arange(len(rows)), count)
+        return Ahead({name: np.array(others.bind(name)) for name in STATE}, ~(others.unsound | self.unsound[rows]))
+
+    def expanded(self, names: Collection[str]) -> Values:
+        """Those of the fields of the model that have a value of their own in each simulation."""
+        found = {name: self._batch.expanded(name) for name in names}
         return {name: values for name, values in found.items() if values is not None}

@@ -15,8 +15,9 @@ import pytest
 
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.training.data.engine.pools import LocalPool
-from dro_grasp.training.data.engine.schedule import synthesize_dataset
+from dro_grasp.training.data.engine.schedule import simulating_threads, synthesize_dataset
 from dro_grasp.training.data.engine.shards import Shard, find_shards, read_yield, sole_run
 from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
 from tests.helpers import engine_work
@@ -72,6 +73,23 @@ def test_the_parent_s_environment_stays_and_workers_have_one_thread(tmp_path, mo
 
 
 @pytest.mark.slow
+def test_workers_that_feed_a_device_simulate_on_their_share_of_the_cores(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "16")
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: set(range(16)))
+    on_device = EngineConfig(synthesis=SynthesisConfig(device="cuda"))
+    assert [simulating_threads(workers, on_device) for workers in (1, 3, 40)] == [16, 5, 1]
+    assert simulating_threads(2, EngineConfig()) == 1
+    assert on_device.threads is None
+    assert EngineConfig().threads == 1
+    work = LocalPool(Job(0, EngineConfig()), 1, PATIENCE, engine_work.telling_threads, threads=5)
+    try:
+        work.submit(Task(Shard("a", "x", 0), 1))
+        (_, failed), = work.wait(PATIENCE)
+    finally:
+        work.close()
+    assert failed.reason == "5 1"
+
+
 def test_an_idle_worker_that_dies_is_replaced():
     work = LocalPool(Job(0, EngineConfig()), 1, 60.0, engine_work.easy)
     try:

@@ -16,6 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import connection
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -82,16 +83,20 @@ def attempt(work: Work, job: Any, task: Any) -> FinishedShard | Failed:
 
 
 class LocalPool:
-    """Processes of one thread each on this machine. A worker's death costs the shard it was making, no other.
+    """Processes on this machine. A worker's death costs the shard it was making, no other.
 
     Each process has a pebble pool of its own. Processes of one pool share a lock, and one that is killed while it hands
     over its shard would keep the lock from the others.
     """
 
-    def __init__(self, job: Any, workers: int, limit: float, work: Work = make_shard) -> None:
-        """Prepare the processes; each starts with its first shard. One that takes longer than the limit [s] is stopped."""
+    def __init__(self, job: Any, workers: int, limit: float, work: Work = make_shard, threads: int = 1) -> None:
+        """Prepare the processes; each starts with its first shard. One that takes longer than the limit [s] is stopped.
+
+        Simulations take so many threads in each.
+        """
         self.job, self.limit, self.work = job, limit, work
-        self.idle = [_one_process() for _ in range(workers)]
+        self.begin = partial(use_one_thread, threads)
+        self.idle = [_one_process(self.begin) for _ in range(workers)]
         self.busy: dict[Future[FinishedShard | Failed], tuple[Any, ProcessPool]] = {}
 
     @property
@@ -105,7 +110,7 @@ class LocalPool:
         try:
             future = pool.schedule(attempt, (self.work, self.job, task), timeout=self.limit)
         except RuntimeError:  # its process died while idle
-            pool = _replaced(pool)
+            pool = self._replaced(pool)
             future = pool.schedule(attempt, (self.work, self.job, task), timeout=self.limit)
         self.busy[future] = task, pool
 
@@ -127,13 +132,17 @@ class LocalPool:
         except TimeoutError:
             result = Failed(f"took longer than {self.limit:.0f} s", died=True)
         except ProcessExpired as error:
-            result, pool = Failed(f"its worker process died (exit code {error.exitcode})", died=True), _replaced(pool)
+            result, pool = Failed(f"its worker process died (exit code {error.exitcode})", died=True), self._replaced(pool)
         except BrokenProcessPool:
-            result, pool = Failed("its worker process died before it began", died=True), _replaced(pool)
+            result, pool = Failed("its worker process died before it began", died=True), self._replaced(pool)
         except Exception as error:  # a result that cannot be handed over: pickling runs code of any kind
             result = failure_of(error)
         self.idle.append(pool)
         return task, result
+
+    def _replaced(self, pool: ProcessPool) -> ProcessPool:
+        _end(pool)
+        return _one_process(self.begin)
 
 
 def _one_process(begin: Callable[[], None] = use_one_thread) -> ProcessPool:
@@ -143,11 +152,6 @@ def _one_process(begin: Callable[[], None] = use_one_thread) -> ProcessPool:
 def _end(pool: ProcessPool) -> None:
     pool.stop()
     pool.join()
-
-
-def _replaced(pool: ProcessPool) -> ProcessPool:
-    _end(pool)
-    return _one_process()
 
 
 CONNECT_TIME = 5.0  # Longest wait for a cluster's head to accept a connection [s]. Ours

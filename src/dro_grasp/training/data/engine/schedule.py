@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dro_grasp.devices import require_device
+from dro_grasp.devices import cores, on_accelerator, require_device
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import given_path, is_unread, make_folder, reading, set_aside
 from dro_grasp.grasps.batch import GraspBatch
@@ -100,7 +100,7 @@ def synthesize_dataset(
     Args:
         grasps_per_pair: A pair is finished when it has this many valid grasps.
         output_dir: The folder; made when missing.
-        workers: Processes, of one thread each; or a function that makes another pool for a job.
+        workers: Processes, see `simulating_threads` for the threads of each; or a function that makes another pool for a job.
         seed: Determines every shard, together with hand, object, round and number of candidates.
         progress: Called with a line of text now and then; None prints to stderr.
 
@@ -124,12 +124,18 @@ def synthesize_dataset(
         states = {pair: PairState() for pair in own_pairs(hands, objects, config.shard)}
         resume(folder, states, grasps_per_pair, say)
         before, started = sum(s.grasps for s in states.values()), time.perf_counter()
-        pool = LocalPool(job, workers, config.shard_seconds) if isinstance(workers, int) else workers(job)
+        pool = workers(job) if not isinstance(workers, int) else LocalPool(
+            job, workers, config.shard_seconds, threads=simulating_threads(workers, config))
         end = math.inf if config.seconds is None else started + config.seconds
         shards = Production(pool, folder, states, grasps_per_pair, config, say, end).finish()
     total = sum(s.grasps for s in states.values())
     failures = {pair: why for pair, s in states.items() if (why := s.why_given_up(grasps_per_pair, config))}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
+
+
+def simulating_threads(workers: int, config: EngineConfig) -> int:
+    """Threads in which each of so many processes simulates: one; its share of the cores where a device makes the candidates."""
+    return max(1, cores() // workers) if on_accelerator(config.synthesis.device) else 1
 
 
 def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:

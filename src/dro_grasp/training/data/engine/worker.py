@@ -95,6 +95,11 @@ class EngineConfig(Checked):
         if not 0 < self.confirm <= 1:
             raise OptionError(f"confirm is {self.confirm}; give the share that the processor judges again, above 0 and up to 1")
 
+    @property
+    def threads(self) -> int | None:
+        """Threads of simulations: one; all that this process may use where a device makes the candidates."""
+        return None if on_accelerator(self.synthesis.device) else 1
+
     def suited(self) -> EngineConfig:
         """With shards as large as suits the device."""
         return dataclasses.replace(self, **ON_DEVICE) if on_accelerator(self.synthesis.device) else self
@@ -163,7 +168,7 @@ def valid_grasps(
     grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
     if config.settle and not config.resettle and len(grasps):
-        closed = settle(hand, obj, grasps, config.protocol, workers=1, device=config.synthesis.device)
+        closed = settle(hand, obj, grasps, config.protocol, workers=config.threads, device=config.synthesis.device)
         shift = hand_shift(hand, grasps, closed)
         made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
         grasps = closed[shift < config.max_shift]
@@ -190,13 +195,14 @@ def _tried(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig, device: str, close_fingers: bool = False
 ) -> tuple[GraspBatch, Counter[str]]:
     """The grasps that pass trials on a device with enough contact, and why the others fail; idle fingers may close between."""
-    trial = simulate(hand, obj, grasps, config.protocol, workers=1, device=device, confirm=False)
+    trial = simulate(hand, obj, grasps, config.protocol, workers=config.threads, device=device, confirm=False)
     loose = trial.success & (trial.contacts < config.min_contact_links)
     passed = grasps.with_trial(trial)[trial.success & ~loose]
     if close_fingers and len(passed):
-        passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, 1, device)
+        passed = closed_where_it_holds(
+            hand, obj, passed, config.protocol, config.min_contact_links, config.threads, device)
     failures = Counter(failure.value for failure in trial.failure if failure)
-    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], 1, device)
+    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], config.threads, device)
     return passed, failures + Counter({LOOSE: int(loose.sum())}) + later
 
 
