@@ -32,7 +32,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.network.checkpoints import describe_weights, history_of, load_weights, save_weights, verify_weights
 from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.network.presets import NetworkConfig
-from dro_grasp.objects.cache import cached_arrays
+from dro_grasp.geometry.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import depth_points, load_scan, scanned_object
 from dro_grasp.objects.scenery import load_scene
