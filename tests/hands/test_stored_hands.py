@@ -21,7 +21,8 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, Tensor):
         return a.dtype == b.dtype and a.stride() == b.stride() and torch.equal(a, b)
     if dataclasses.is_dataclass(a):
-        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a) if f.compare)
+        compared = (f.name for f in dataclasses.fields(a) if f.compare)
+        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in compared)
     return type(a) is type(b) and a == b
 
 

@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects import shape, surface_distances
 from dro_grasp.geometry.cache import cache_folder, cached_arrays, content_hash
+from dro_grasp.objects import shape, surface_distances
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import cloud_object, mesh_object
 from dro_grasp.objects.shape import BALL_OUTSIDE, BALL_RADII, BALL_SPACING, DENSITY, ObjectModel, solid_of

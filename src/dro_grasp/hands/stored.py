@@ -26,7 +26,8 @@ CODE = Path(__file__).parents[1]  # Folder of the package
 def stored_hand(description: Description, name: str, seed: int, n_points: int) -> Hand:
     """As `build_hand`, from the cache where the same code has built it before; errors are the same."""
     key = hashlib.sha256(f"{description.sha256} {seed} {n_points} {_code()}".encode()).hexdigest()
-    stored = cached_arrays(f"hand-{key[:24]}", lambda: _packed(build_hand(description, name=name, seed=seed, n_points=n_points)))
+    stored = cached_arrays(
+        f"hand-{key[:24]}", lambda: _packed(build_hand(description, name=name, seed=seed, n_points=n_points)))
     return _unpacked(stored, description, name)
 
 
