@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from dro_grasp.files import replacing
-from dro_grasp.objects.cache import cache_folder
+from dro_grasp.geometry.cache import cache_folder
 
 ROOT = Path(__file__).parents[1]
 """The checkout."""

@@ -161,8 +161,8 @@ def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytes
     from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.compare.methods import make_method
     from dro_grasp.frames import read_motion
+    from dro_grasp.geometry.cache import cache_folder
     from dro_grasp.hands.library import locate_hand
-    from dro_grasp.objects.cache import cache_folder
 
     monkeypatch.setenv("HOME", str(tmp_path))
     readers: list[tuple[Callable[[str], object], str]] = [
@@ -190,7 +190,7 @@ def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytes
 def test_an_empty_or_relative_cache_variable_does_not_count(
     stated: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dro_grasp.objects.cache import cache_folder
+    from dro_grasp.geometry.cache import cache_folder
 
     monkeypatch.delenv("DRO_GRASP_CACHE", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -25,6 +25,7 @@ from dro_grasp.arm.robot import load_robot
 from dro_grasp.errors import DroGraspError
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion
+from dro_grasp.geometry.cache import cached_arrays
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.grasp_file import METADATA_KEY
 from dro_grasp.grasps.sources import frame_of, hand_of, object_of, with_sources
@@ -32,7 +33,6 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.network.checkpoints import describe_weights, history_of, load_weights, save_weights, verify_weights
 from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.network.presets import NetworkConfig
-from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import depth_points, load_scan, scanned_object
 from dro_grasp.objects.scenery import load_scene

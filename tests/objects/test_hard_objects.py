@@ -17,9 +17,9 @@ import pytest
 import trimesh
 
 from dro_grasp.cli.main import main
+from dro_grasp.geometry.cache import content_hash
 from dro_grasp.objects.builtin import BUILTIN, HARD, make_builtin, usual
 from dro_grasp.objects.builtin.construction import HARD_TEST, HARD_TRAIN, STEEL
-from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.convex_parts import pack
 from dro_grasp.objects.shape import DENSITY, ObjectModel

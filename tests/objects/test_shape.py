@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.cache import cache_folder, cached_arrays, content_hash
 from dro_grasp.objects import shape, surface_distances
-from dro_grasp.objects.cache import cache_folder, cached_arrays, content_hash
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import cloud_object, mesh_object
 from dro_grasp.objects.shape import BALL_OUTSIDE, BALL_RADII, BALL_SPACING, DENSITY, ObjectModel, solid_of
@@ -160,7 +160,7 @@ def test_nothing_half_written_stays_in_the_cache(cache: Path, monkeypatch: pytes
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("dro_grasp.objects.cache.os.replace", fail)
+    monkeypatch.setattr("dro_grasp.geometry.cache.os.replace", fail)
     cached_arrays("key", lambda: {"a": np.arange(3)})
     assert list(cache.iterdir()) == []
 

@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, Int
 
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.hands.description.compiling import collide
-from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol

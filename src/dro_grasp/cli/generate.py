@@ -11,6 +11,7 @@ from dro_grasp.cli.given_scene import check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.cli.remote import generate_at, server_of
+from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
@@ -136,6 +137,7 @@ class Generate:
     def _prepare(self) -> tuple[list[str], list[Path | None], list[Path | None], Job]:
         """Names of the objects, where their files and pictures go, and what they share; libraries take seconds to load."""
         begin = time.perf_counter()
+        load_libraries()
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects

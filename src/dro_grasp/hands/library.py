@@ -51,10 +51,10 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
         HandError: No such hand, or its description cannot be used.
         OptionError: The hand cannot have so many points, or so few.
     """
-    from dro_grasp.hands.build import build_hand  # names of hands are asked for without PyTorch
+    from dro_grasp.hands.stored import stored_hand  # names of hands are asked for without PyTorch
 
     description, label = load_hand_description(name)
-    return build_hand(description, name=label, seed=seed, n_points=n_points)
+    return stored_hand(description, label, seed, n_points)
 
 
 def load_hand_description(name: str | Path) -> tuple[Description, str]:

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.cache import Arrays, cached_arrays, content_hash, store_arrays, stored_arrays
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import even_directions
-from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash, store_arrays, stored_arrays
 from dro_grasp.objects.cutting import CutShortError, Part, cut_apart
 from dro_grasp.objects.surface_distances import signed_distances
 

@@ -12,10 +12,10 @@ from scipy.spatial import KDTree, QhullError
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
+from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
-from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
 from dro_grasp.objects.perception.things import AS_SCENE, one_thing, refuse_scene
 from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned

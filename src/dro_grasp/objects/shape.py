@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.cache import cached_arrays, content_hash
 from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.geometry.point_clouds import one_per_cell, random_half
-from dro_grasp.objects.cache import cached_arrays, content_hash
 from dro_grasp.objects.convex_parts import Part, Progress, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 

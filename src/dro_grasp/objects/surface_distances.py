@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 from scipy.spatial import KDTree
 
-from dro_grasp.objects.cache import Arrays
+from dro_grasp.geometry.cache import Arrays
 
 GRID_SPACING = 0.003  # Spacing of a grid of signed distances [m] (ours)
 GRID_PADDING = 0.04  # Distance that the grid extends beyond the object [m] (ours)

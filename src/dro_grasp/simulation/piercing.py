@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.devices import cores
-from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
+from dro_grasp.geometry.cache import Arrays, cached_arrays, content_hash
 from dro_grasp.simulation.scene import OBJECT_GROUP, TrialScene
 
 GAP = 0.015  # Way between two links that an axis may run nearer to the surface or outside [m]. Ours: Shadow's thumb has 13 mm
