@@ -1,4 +1,5 @@
-"""The network alone: the first draw, and the choice among several z and placements, with and without their imbalance.
+"""The network alone: the first draw, and the choice among several z and placements, with and without their imbalance, and by
+all points of the hand at the end or by those of the network alone.
 
 python -m lab.benchmarks.choice [--hands HAND ...] [--objects OBJECT ...] [--num N] [--weights NAME] [--each] [--json]
 
@@ -37,9 +38,10 @@ BLIND = dataclasses.replace(ChoicePenalties(), imbalance=0.0)
 """Today's other penalties, which do not ask whether the fingers' pushes cancel."""
 ROWS = {
     "first draw": ChoiceConfig.first(),
-    "1 x 32, without imbalance": ChoiceConfig(1, 32, BLIND),
+    "1 x 32, without imbalance": ChoiceConfig(1, 32, penalties=BLIND),
     "1 x 32": ChoiceConfig(1, 32),
-    "2 x 16, without imbalance": ChoiceConfig(2, 16, BLIND),
+    "2 x 16, without imbalance": ChoiceConfig(2, 16, penalties=BLIND),
+    "2 x 16, by the network's points": ChoiceConfig(2, 16, finalists=1),
     "2 x 16": ChoiceConfig(2, 16),
     "4 x 4": ChoiceConfig(4, 4),
     "4 x 8": ChoiceConfig(4, 8),

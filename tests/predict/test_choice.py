@@ -16,7 +16,7 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.grasp_energy import Surroundings, Workspace
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
+from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores, posed_cloud
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -118,9 +118,10 @@ class Watched(DistanceNetwork):
         return super().distances(moves)
 
 
-def test_of_all_that_is_offered_for_a_candidate_the_hand_that_suits_the_object_best_is_decoded() -> None:
+@pytest.mark.parametrize("finalists", [1, 6])
+def test_of_all_that_is_offered_for_a_candidate_the_hand_that_suits_the_object_best_is_decoded(finalists: int) -> None:
     network, problem = Watched(), GraspProblem(loaded_hand("allegro"), load_object("mug"))
-    config = ProposalConfig(choice=ChoiceConfig(placements=3, draws=2), batch_size=4, network_batch_size=2)
+    config = ProposalConfig(choice=ChoiceConfig(placements=3, draws=2, finalists=finalists), batch_size=4, network_batch_size=2)
     with torch.no_grad():
         made = propose(problem, network, 4, torch.Generator().manual_seed(0), config)
     assert len(made) == 4
@@ -131,7 +132,10 @@ def test_of_all_that_is_offered_for_a_candidate_the_hand_that_suits_the_object_b
         # The network's axes, found from what it is shown of the object.
         axes = torch.linalg.lstsq((cloud - cloud.mean(0)).expand(6, -1, -1), offered.obj).solution
         points = offered.points @ axes.mT[:, None] + cloud.mean(0)
-        scores = choice_scores(thin, problem.field, points, config.choice.penalties).reshape(2, 6)
+        judged = thin
+        if finalists > 1:
+            judged, points = problem.hand, posed_cloud(thin, points, problem.hand)
+        scores = choice_scores(judged, problem.field, points, config.choice.penalties).reshape(2, 6)
         chosen += scores.argmax(1).tolist()
         for row, best in enumerate(scores.argmax(1).tolist()):
             torch.testing.assert_close(decoded.points[row, 0], offered.points[3 * row + best // 2, best % 2])
@@ -157,8 +161,23 @@ def test_fingers_on_one_side_are_worse_than_fingers_around() -> None:
     assert not far.any(), "fingers that are nowhere near push nothing"
 
 
-@pytest.mark.parametrize("wrong", [{"draws": 0}, {"placements": -1}])
+@pytest.mark.parametrize("wrong", [{"draws": 0}, {"placements": -1}, {"finalists": 0}])
 def test_less_than_one_draw_is_refused(wrong: dict[str, int]) -> None:
     (name, value), = wrong.items()
     with pytest.raises(OptionError, match=f"{name} is {value}; draw at least one"):
         ChoiceConfig(**wrong)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadowhand"])
+def test_links_stand_where_their_thinned_points_are(name: str) -> None:
+    whole, generator = loaded_hand(name), torch.Generator().manual_seed(1)
+    thin, q = whole.with_points(160), whole.random_joints(6, generator)
+    T = torch.eye(4).repeat(6, 1, 1)
+    T[:, :3, 3] = torch.randn(6, 3, generator=generator)
+    posed = posed_cloud(thin, thin.points(q, T).unflatten(0, (2, 3)), whole)
+    true = whole.points(q, T).unflatten(0, (2, 3))
+    known = thin.registrable[whole.link_index]
+    torch.testing.assert_close(posed[..., known, :], true[..., known, :], atol=1e-4, rtol=0)
+    moved, of_other = thin.points(q, T), (thin.link_index != whole.link_index[~known][:, None]) * 1e3
+    apart = torch.cdist(posed[..., ~known, :].flatten(0, 1), moved) + of_other
+    assert float(apart.amin(-1).amax() if apart.numel() else 0.0) < 1e-3, "a point of their own link"

@@ -10,11 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.distance_matrix import Segments, segments_of
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField, DistanceFields
+from dro_grasp.geometry.se3 import apply, register
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -22,6 +24,7 @@ from dro_grasp.optimize.grasp_energy import Workspace
 
 CROWDING_POINTS = 64  # Hand points, spread evenly, between which the distance of fingers is measured (ours)
 
+FAR = 1e3  # What is added to the distance of points of other links [m] (ours)
 LEAST_PART = 1e-6  # Sum of the fingers' parts below which they count as not near at all (ours)
 
 
@@ -59,6 +62,8 @@ class ChoiceConfig(Checked):
     """Placements drawn for each candidate; 1 takes the first."""
     draws: int = 16
     """z drawn for each placement; 1 takes the first."""
+    finalists: int = 4
+    """Of these, how many of the best are compared by all points of the hand; 1 takes the best by the network's points."""
     penalties: ChoicePenalties = ChoicePenalties()
     """What speaks against a moved hand."""
 
@@ -66,17 +71,18 @@ class ChoiceConfig(Checked):
         """Refuse numbers that make no sense.
 
         Raises:
-            OptionError: `placements` or `draws` is not positive.
+            OptionError: `placements`, `draws` or `finalists` is not positive.
         """
         super().__post_init__()
-        for name in ("placements", "draws"):
+        for name in ("placements", "draws", "finalists"):
             if getattr(self, name) < 1:
-                raise OptionError(f"{name} is {getattr(self, name)}; draw at least one for each candidate")
+                raise OptionError(f"{name} is {getattr(self, name)}; draw at least one, and compare at least one, for each "
+                                  "candidate")
 
     @staticmethod
     def first() -> ChoiceConfig:
         """The first draw, whatever it is: what the paper does."""
-        return ChoiceConfig(placements=1, draws=1)
+        return ChoiceConfig(placements=1, draws=1, finalists=1)
 
 
 def choice_scores(
@@ -117,3 +123,33 @@ def choice_scores(
     rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)
     apart = torch.cdist(points[..., some, :], points[..., some, :])
     return score - penalties.crowding * (penalties.apart - torch.where(rivals, apart, torch.inf).amin((-1, -2))).clamp_min(0)
+
+
+def posed_cloud(hand: Hand, moved: Float[Tensor, "*b n_points 3"], whole: Hand) -> Float[Tensor, "*b n_whole 3"]:
+    """All points of a hand, each with its link where the moved points of a thinned hand are [m].
+
+    z moves each point by itself, so that links bend; what is decoded are rigid links. Points of links that cannot be registered
+    take the place of the nearest moved point of their link, or of the hand.
+
+    Args:
+        hand: The thinned hand.
+        moved: Its points.
+        whole: The same hand with all points.
+    """
+    segments, place, nearest = whole.kept(("posed by", hand.n_points, moved.device), lambda: _places(hand, whole))
+    rows = moved.flatten(0, -3)
+    own = segments.spread(len(rows))
+    poses, _ = register(own.local, own.of_points(rows), own.weight)
+    posed = apply(poses[:, place.clamp_min(0)], whole.link_points)
+    return torch.where(place[:, None] < 0, rows[:, nearest], posed).unflatten(0, moved.shape[:-2])
+
+
+def _places(hand: Hand, whole: Hand) -> tuple[Segments, Int[Tensor, " n_whole"], Int[Tensor, " n_whole"]]:
+    """Segments of a thinned hand; of each point of the whole one, the place of its link among them or -1, and a near point."""
+    device = hand.link_points.device
+    segments = segments_of([hand], device)
+    place = torch.full((hand.tree.n_links,), -1, device=device)
+    place[segments.links[0]] = torch.arange(segments.links.shape[1], device=device)
+    other = (hand.link_index != whole.link_index[:, None]) * FAR
+    opened = hand.canonical_joints()
+    return segments, place[whole.link_index], (torch.cdist(whole.points(opened), hand.points(opened)) + other).argmin(-1)

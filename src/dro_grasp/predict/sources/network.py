@@ -28,7 +28,7 @@ from dro_grasp.kinds import Checked
 from dro_grasp.network.network import DistanceNetwork, Moves
 from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, approach_cost, wrist_rotations
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
+from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores, posed_cloud
 from dro_grasp.predict.sources.source import Asked, Candidates, Progress, Source
 
 HIGHEST_TEMPERATURE = 2.0  # Highest temperature that is accepted; 1 is what the weights were trained for (ours)
@@ -243,7 +243,7 @@ def _distances(
     field: DistanceField | DistanceFields, config: ProposalConfig, watch: Stopwatch,
 ) -> Float[Tensor, "b n m"]:
     """D(R,O) of the best of p placements with k draws each of every open hand; the same in every frame."""
-    hand = problem.thinned(network.config.n_hand)
+    hand, whole = problem.thinned(network.config.n_hand), problem.thinned(problem.hand.n_points)
     rivals, draws = inputs.noise.shape[1:3]
     size = at_once(problem.device, ON_CPU, _network_bytes(network, rivals, draws), config.network_batch_size)
     parts = [slice(start, start + size) for start in range(0, len(inputs.joints), size)]
@@ -263,9 +263,15 @@ def _distances(
     def choose(moves: Moves, axes: Float[Tensor, "c 3 3"], centre: Float[Tensor, "c 1 1 3"], part: slice) -> Moves:
         points = moves.points @ axes[:, None].mT + centre
         own = field if isinstance(field, DistanceField) else field.rows(slice(rivals * part.start, rivals * part.stop))
-        suits = choice_scores(hand, own, points, config.choice.penalties, problem.workspace)
-        best = suits.reshape(-1, rivals * draws).argmax(-1)
-        return moves.pick(torch.arange(len(best), device=best.device) * rivals + best // draws, best % draws)
+        suits = choice_scores(hand, own, points, config.choice.penalties, problem.workspace).reshape(-1, rivals * draws)
+        best = suits.topk(min(config.choice.finalists, rivals * draws)).indices
+        if best.shape[1] > 1:
+            final = posed_cloud(hand, points.reshape(*suits.shape, -1, 3).take_along_dim(best[..., None, None], 1), whole)
+            own = own if isinstance(own, DistanceField) else own.rows(slice(None, None, rivals))
+            suits = choice_scores(whole, own, final, config.choice.penalties, problem.workspace)
+            best = best.take_along_dim(suits.argmax(-1, keepdim=True), 1)
+        row = torch.arange(len(best), device=best.device) * rivals + best[:, 0] // draws
+        return moves.pick(row, best[:, 0] % draws)
 
     with watch("network"):
         moves, axes, middles = zip(*each(move, parts), strict=True)
