@@ -1,5 +1,6 @@
-"""The network alone: the first draw, and the choice among several z and placements, with and without their imbalance, and by
-all points of the hand at the end or by those of the network alone.
+"""The network alone: the first draw, and the choice among several z and placements.
+
+The choice is made with and without their imbalance, and by all points of the hand at the end or by those of the network alone.
 
 python -m lab.benchmarks.choice [--hands HAND ...] [--objects OBJECT ...] [--num N] [--weights NAME] [--each] [--json]
 
