@@ -86,14 +86,15 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     assert np.allclose(postures.squeeze, hand[closed.stop - 1], atol=1e-6)
     cell = Workcell(robot, (), ball)
     rehearsal = Rehearsal(cell)
-    first = rehearsal.share(chosen, postures)
-    assert first > 0
-    assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
-    assert rehearsal.share(chosen, postures) == first  # nothing is left from the one before
+    first = rehearsal.rehearse(chosen, postures)
+    assert first.share > 0
+    never = rehearsal.rehearse(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp))
+    assert (never.share, never.T_world_wrist) == (0, None)
+    assert rehearsal.rehearse(chosen, postures).share == first.share  # nothing is left from the one before
     assert planned.notes.seconds["rehearsal"] > 0
     for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
         line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
-        assert rehearsal.holds(line, postures, DEVIATIONS[0])
+        assert rehearsal.grip(line, postures, DEVIATIONS[0]) is not None
     rehearsal = Rehearsal(cell, few_contacts=12)
     seen, scene = [], rehearsal.scene
     honest = scene.advance
@@ -103,7 +104,7 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
         honest(*arguments, **options)
 
     scene.advance = advance
-    rehearsal.holds(chosen, postures, DEVIATIONS[0])
+    rehearsal.grip(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 

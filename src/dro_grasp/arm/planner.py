@@ -374,7 +374,11 @@ def rehearsed(task: Task, tries: Tries, found: Iterator[Feasible]) -> list[Feasi
         if task.rehearsal is not None and goal.index not in tries.share:
             count += 1
             with tries.watch("rehearsal"):
-                tries.share[goal.index] = task.rehearsal.share(goal, Postures.of(task.robot, grasps, goal.index))
+                done = task.rehearsal.rehearse(goal, Postures.of(task.robot, grasps, goal.index))
+            tries.share[goal.index] = done.share
+            if task.place is not None and not task.place.falls and done.T_world_wrist is not None:
+                with tries.watch("reach"):
+                    goal = tries.found[goal.index] = task.reach.put_as_held(goal, grasps, done.T_world_wrist)
         share = tries.share.get(goal.index)
         if share == 0:
             tries.lost.append(goal)
@@ -438,7 +442,7 @@ def carry_path(task: Task, goal: Feasible, hand: Postures, seed: int) -> Float[n
     """Waypoints with the object in the hand, from the end of the lift to above its place; None if none is found."""
     robot, cell = task.robot, task.cell
     assert goal.put is not None
-    T_grasp = robot.T_world_wrist(goal.approach[-1])
+    T_grasp = goal.put.T_grasp
 
     def free(q: Float[np.ndarray, " n_arm"]) -> bool:
         return cell.free(q, hand.squeeze, moved=carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=CARRIED)
@@ -466,7 +470,8 @@ def _described(
         None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
         scales=None if robot.drivers.are_usual else robot.drivers.scales,
-        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS})
+        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS},
+        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist())
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
