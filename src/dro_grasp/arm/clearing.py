@@ -1,6 +1,7 @@
 """One thing after the other: look, choose, pick, drop into the bin, look again, until nothing is left on the table.
 
-What is there is what the camera sees. From one look to the next, nothing is kept but where picks have failed. Ours.
+What is there is what the camera sees. From one look to the next, nothing is kept but where picks have failed, and with which
+grasps. A pick counts when the thing is no longer seen where it was. Ours.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
+from dro_grasp.arm.parts import parted
+from dro_grasp.arm.picks import Memory, Outcome, Pick
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.table_scene import pick_object, sort_out
-from dro_grasp.arm.trajectory import find_path, smooth, still
+from dro_grasp.arm.table_scene import PickedObject, pick_object, sort_out
+from dro_grasp.arm.trajectory import find_path, smooth, standing, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
@@ -27,10 +30,10 @@ from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
-SAME = 0.04  # Farthest that a thing may be from where a pick failed to count as the same [m] (ours)
 HOME_SECONDS = 5.0  # Longest time for a path home [s] (ours)
 WALL = 0.01  # Thickness of the bin's walls [m] (ours)
 BESIDE = 0.03  # Distance from the bin within which what is seen counts as the bin [m] (ours): its walls are seen with noise
+WATCHED, EVERY = 11, 0.02  # How often joints are measured to see whether something slips, and how often [s] (ours)
 OPENING_SECONDS = 1.0  # Time in which a hand opens that holds nothing [s] (ours)
 
 
@@ -114,25 +117,13 @@ class Rig(Protocol):
 
 
 @dataclass(frozen=True)
-class Pick:
-    """What became of one pick."""
-
-    place: tuple[float, float]
-    """Where the thing stood [m]."""
-    stage: str
-    """Where it ended: see, plan, lift, carry, or done."""
-    reason: str = ""
-    """Why it failed."""
-
-
-@dataclass(frozen=True)
 class Cleared:
     """What became of a table."""
 
     picks: tuple[Pick, ...]
     """All picks, in their order."""
     left: tuple[Pick, ...]
-    """The last pick of each thing that was given up."""
+    """What is left or out of sight: the last pick of each such thing, and why it was given up."""
 
     @property
     def done(self) -> int:
@@ -153,7 +144,7 @@ def clear_table(
         predictor: Proposes grasps; the default weights if omitted.
         config: Where the bin is, and how often is tried.
         seed: Of all plans.
-        progress: Called after each pick.
+        progress: Called after each pick, once the camera has looked again where something moved.
         judged: Called with each judgement of whether the hand holds something, when it is made.
 
     Raises:
@@ -164,22 +155,34 @@ def clear_table(
     if robot.table is None or robot.camera is None:
         raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
                           "file: what is to be cleared has to be seen on one")
-    picks, failed = list[Pick](), list[Pick]()
-    while len(picks) < config.most:
+    memory, picks, moved = Memory(config.tries), list[Pick](), None
+    tell = progress or (lambda pick: None)
+    while True:
         points, places = _things(robot, rig, config.bin)
-        left = sorted((place for place in places if len(_near(failed, place)) < config.tries),
-                      key=lambda place: len(_near(failed, place)))  # the rest of the order is that of places
-        if not left:
-            return Cleared(tuple(picks), tuple(_near(failed, place)[-1] for place in places))
+        if moved is not None:
+            picks[-1] = memory.see(moved, in_world(robot, points), places)
+            tell(picks[-1])
+            moved = None
+        left = memory.left(places)
+        if not left or len(picks) >= config.most:
+            return Cleared(tuple(picks), memory.given_up(places))
         for place in left:  # until something moves, and what was seen is no longer true
-            pick = _pick(robot, rig, points, place, predictor, config, seed + len(picks), judged)
-            picks.append(pick)
-            failed += [pick] if pick.reason else []
-            if progress is not None:
-                progress(pick)
-            if pick.stage not in ("see", "plan") or len(picks) == config.most:
+            made = _pick(robot, rig, points, place, predictor, config, seed + len(picks), judged, memory.wrists(place))
+            picks.append(made.pick)
+            if made.pick.stage not in ("see", "plan"):
+                moved = made
                 break
-    return Cleared(tuple(picks), tuple(failed))
+            memory.note(made)
+            tell(made.pick)
+            if len(picks) >= config.most:
+                break
+
+
+def in_world(robot: Robot, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Points in the frame of the robot's camera, in the world [m]."""
+    assert robot.camera is not None
+    T = robot.camera.T_world_camera
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Float[np.ndarray, "n 3"], list[tuple[float, float]]]:
@@ -187,7 +190,7 @@ def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Float[np.ndarray, "n 3"],
     assert robot.camera is not None
     assert robot.table is not None
     T, points = robot.camera.T_world_camera, rig.look()
-    points = points[~bin.holds(points @ T[:3, :3].T + T[:3, 3], BESIDE)]
+    points = points[~bin.holds(in_world(robot, points), BESIDE)]
     try:
         places = sort_out(points, T, robot.table).places
     except ObjectError:
@@ -197,48 +200,86 @@ def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Float[np.ndarray, "n 3"],
     return points, [(float(x), float(y)) for x, y in places[order]]
 
 
-def _near(picks: Sequence[Pick], place: tuple[float, float]) -> list[Pick]:
-    return [pick for pick in picks if np.hypot(pick.place[0] - place[0], pick.place[1] - place[1]) < SAME]
-
-
 def _pick(
     robot: Robot, rig: Rig, points: Float[np.ndarray, "n 3"], place: tuple[float, float], predictor: GraspPredictor,
-    config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None,
-) -> Pick:
-    """Pick the thing at a place and drop it into the bin; the arm is at home afterwards."""
+    config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None, avoid: Sequence[Float[np.ndarray, "4 4"]],
+) -> Outcome:
+    """Pick the thing at a place and drop it into the bin; the arm is at home afterwards.
+
+    Grasps near those to avoid are not tried again, and then, or where there is no plan for it all, its parts are.
+    """
     assert robot.camera is not None
     try:
         seen = pick_object("thing", points, robot, robot.camera.T_world_camera, near=place)
     except DroGraspError as error:
-        return Pick(place, "see", str(error))
+        return Outcome(Pick(place, "see", str(error)))
+    reasons = list[str]()
+    for part in [*parted(seen), seen] if avoid else [seen, *parted(seen)]:
+        try:
+            made = _planned(part, predictor, config, seed, avoid)
+        except DroGraspError as error:
+            reasons.append(str(error))
+            continue
+        return _carry_out(robot, rig, part, place, made, config, judged)
+    return Outcome(Pick(place, "plan", reasons[-1 if avoid else 0]))  # that of it all
+
+
+def _planned(
+    seen: PickedObject, predictor: GraspPredictor, config: ClearConfig, seed: int, avoid: Sequence[Float[np.ndarray, "4 4"]]
+) -> MotionPlan:
+    """A motion that drops a thing into the bin, or a PlanError."""
+    assert seen.robot.table is not None
+    (x, y), height = config.bin.centre, config.bin.height
+    above = Place((x, y, seen.robot.table.height + height + config.drop), falls=height + config.drop)
+    return plan(seen.robot, seen.obj, obstacles=[*seen.obstacles, config.bin.walls(seen.robot.table.height)],
+                predictor=predictor, config=config.plan, seed=seed, place=above, avoid=avoid)
+
+
+def _carry_out(
+    robot: Robot, rig: Rig, seen: PickedObject, place: tuple[float, float], made: MotionPlan, config: ClearConfig,
+    judged: Callable[[HoldCheck], None] | None,
+) -> Outcome:
+    """Follow a plan to the bin; what slips as it is lifted is put back, and what is lost is left where it fell."""
     assert seen.robot.table is not None
     around = [*seen.obstacles, config.bin.walls(seen.robot.table.height)]
-    x, y = config.bin.centre
-    above = Place((x, y, seen.robot.table.height + config.bin.height + config.drop), falls=config.bin.height + config.drop)
-    try:
-        made = plan(seen.robot, seen.obj, obstacles=around, predictor=predictor, config=config.plan, seed=seed, place=above)
-    except DroGraspError as error:
-        return Pick(place, "plan", str(error))
-    for stages, stage in ((STAGES, "lift"), (PLACING[:1], "carry")):
+    cloud = seen.obj.cloud if seen.obj.seen is None else seen.obj.seen
+    pick = Pick(place, "done")
+    for stages in (STAGES, PLACING[:1]):
         _follow(rig, made, stages)
-        check = made.check_hold(rig.joints()[1])
+        check = _judge(rig, made, stages[-1])
         if judged is not None:
             judged(check)
-        if check.state != "held":
+        if check.state == "empty" or (check.state == "slipping" and stages is STAGES):
+            if check.state == "slipping":
+                _follow(rig, made, ("lift",), back=True)
             _open(rig, robot)
             _go_home(rig, Workcell(seen.robot, [*around, seen.obj]))
-            return Pick(place, stage, f"the hand is {check.state}, by its joints")
-    _follow(rig, made, PLACING[1:])
+            pick = Pick(place, stages[-1], f"the hand is {check.state}, by its joints")
+            return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
+    _follow(rig, made, PLACING[1:])  # what slips above the bin may do so
     _go_home(rig, Workcell(seen.robot, around))
-    return Pick(place, "done")
+    return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
 
 
-def _follow(rig: Rig, made: MotionPlan, stages: Sequence[str]) -> None:
-    """Follow some stages of a plan, which follow each other."""
+def _judge(rig: Rig, made: MotionPlan, stage: str) -> HoldCheck:
+    """Whether the hand holds something at the end of a stage, by its joints as they are and as they move."""
+    row, rows = made.part(stage).stop - 1, [rig.joints()[1]]
+    for _ in range(WATCHED - 1):
+        rig.move(standing(made.arm.position[row], EVERY), standing(made.hand.position[row], EVERY))
+        rows.append(rig.joints()[1])
+    return made.check_hold(rows[-1], watched=np.stack(rows), seconds=EVERY * (WATCHED - 1))
+
+
+def _follow(rig: Rig, made: MotionPlan, stages: Sequence[str], back: bool = False) -> None:
+    """Follow some stages of a plan, which follow each other, or go back along them."""
     rows = slice(made.part(stages[0]).start, made.part(stages[-1]).stop)
     arm, hand = (Trajectory(part.time[rows] - part.time[rows][0], part.position[rows], part.velocity[rows],
                             part.acceleration[rows]) for part in (made.arm, made.hand))
-    rig.move(arm, hand)
+    rig.move(*(_reversed(arm), _reversed(hand)) if back else (arm, hand))
+
+
+def _reversed(way: Trajectory) -> Trajectory:
+    return Trajectory(way.time[-1] - way.time[::-1], way.position[::-1], -way.velocity[::-1], way.acceleration[::-1])
 
 
 def _open(rig: Rig, robot: Robot) -> None:
@@ -251,14 +292,20 @@ def _open(rig: Rig, robot: Robot) -> None:
 
 
 def _go_home(rig: Rig, cell: Workcell) -> None:
-    """Bring the arm home, clear of what was seen, with the hand open.
+    """Bring the arm home with the hand open, clear of what was seen, where it can.
 
     Raises:
         PlanError: There is no path.
     """
     robot = cell.robot
     arm, opened = rig.joints()[0], robot.open_hand
-    found = find_path(arm, robot.home[None], lambda q: cell.free(q, opened), *robot.working_range, HOME_SECONDS, 0)
+    found = None
+    for around in (cell, Workcell(robot)):  # what it touches where it is may be noise, or may give way
+        def free(q: Float[np.ndarray, " n_arm"], around: Workcell = around) -> bool:
+            return around.free(q, opened)
+
+        if (found := find_path(arm, robot.home[None], free, *robot.working_range, HOME_SECONDS, 0)) is not None:
+            break
     if found is None:
         met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
         raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")

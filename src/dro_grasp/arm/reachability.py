@@ -46,6 +46,7 @@ class Fault(StrEnum):
     NO_LINE = "without a straight approach"
     NO_LIFT = "without a straight lift"
     NO_PLACE = "without a way to put it there"
+    FAILED = "like one that failed before"
     LOSES = "losing the object when rehearsed"
     NO_PATH = "without a path"  # to any of the goals, or the timed motion would touch something
 
