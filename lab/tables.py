@@ -50,7 +50,7 @@ TASKS = {"lifts": "lifted, held and shaken", "asked": "the same, of the one aske
 """Measurements of attempts, and what they are called."""
 LIFTED = {*PLACING, "place", "done"}
 """Where attempts with a place end whose object was in the air."""
-HELD_BY = "twice, efforts"
+HELD_BY = "watched"
 """What is measured of hands that may hold, in `lab.benchmarks.hold_check`."""
 Cell = dict[str, Any]
 

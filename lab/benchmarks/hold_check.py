@@ -6,6 +6,9 @@
 What is expected is simulated with the object in its place. What is measured is simulated with another place, friction, mass and
 servos (`robust`), under the object's weight from a random side, with noise of encoders. Grasps that move the object by 15 mm as
 they close are left out, and so are those that it then leaves by itself: a plan's grasps are settled and rehearsed.
+
+Held is what moves less than half a millimetre in the fifth of a second in which joints are watched. Slipping is what a force
+tears away, has moved by one to six centimetres, and moves by two centimetres a second or more. What lies between is neither.
 """
 
 from __future__ import annotations
@@ -42,9 +45,13 @@ DATA = Path(__file__).parents[2] / "data" / "grasps"
 STILL = 0.015  # An object that has moved no farther is where it was [m]
 PULLS = (1.5, 3.0, 6.0, 12.0, 25.0, 50.0)  # Forces that tear an object away, in weights
 SENSOR = 0.1  # Noise of measured efforts, as a share of the largest expected one
-HOW = ("once", "once, efforts", "twice", "twice, efforts")
-"""What is measured: joints, or efforts too; after the lift, or after the squeeze too."""
+HOW = ("once", "once, efforts", "twice", "twice, efforts", "watched", "watched, efforts")
+"""What is measured: joints, or efforts too; after the lift, or after the squeeze too, or for WATCHED seconds."""
+WATCHED, EVERY = 0.2, 0.02  # How long joints are watched, and how often they are measured [s]
+ROWS = round(WATCHED / EVERY) + 1
+RESTS = 0.0005  # How far an object has moved at most meanwhile that is held [m]
 SLIPPED = (0.01, 0.06)  # How far an object has moved that is slipping [m]
+SLIPS = 0.02  # Least speed of it over the last half of the time [m/s]
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,7 @@ class Measured:
     joints: Float[np.ndarray, " n_dof"]
     efforts: Float[np.ndarray, " n_dof"]  # [Nm or N]
     before: Float[np.ndarray, " n_dof"] | None
+    watched: Float[np.ndarray, "k n_dof"]  # The last row are `joints`
 
 
 def situations(hand: Hand, name: str, obj: ObjectModel, grasps: GraspBatch, rng: np.random.Generator) -> list[Measured]:
@@ -71,7 +79,10 @@ def situations(hand: Hand, name: str, obj: ObjectModel, grasps: GraspBatch, rng:
     good = _stays(usual, rng)[1]
     real = Rollout(scene, twice, 1, conditions=conditions)
     closed, held = _stays(real, rng)
-    joints, ways = real.poses()[0], _slipping(real, rng)
+    still, moved = _watched(real)
+    held &= moved < RESTS
+    moving = _slipping(real, rng)
+    joints, ways = still[:, -1], moving[:, -1]
     empty = rest(Rollout(scene, twice, 1, conditions=conditions), twice, empty=True)[0].numpy()
 
     def efforts(at: Float[np.ndarray, "n n_dof"]) -> Float[np.ndarray, "n n_dof"]:
@@ -83,10 +94,10 @@ def situations(hand: Hand, name: str, obj: ObjectModel, grasps: GraspBatch, rng:
     for i in np.flatnonzero(good & held):
         expected = HoldExpectation.of(twice, int(i))
         assert expected is not None
-        found += [Measured(name, "held", expected, joints[i], pressed[i], closed[i]),
-                  Measured(name, "empty", expected, empty[i], idle[i], None)]
+        found += [Measured(name, "held", expected, joints[i], pressed[i], closed[i], still[i]),
+                  Measured(name, "empty", expected, empty[i], idle[i], None, np.tile(empty[i], (ROWS, 1)))]
         if np.isfinite(ways[i]).all():
-            found.append(Measured(name, "slipping", expected, ways[i], lost[i], closed[i]))
+            found.append(Measured(name, "slipping", expected, ways[i], lost[i], closed[i], moving[i]))
     return found
 
 
@@ -98,15 +109,30 @@ def _stays(rollout: Rollout, rng: np.random.Generator) -> tuple[Float[np.ndarray
     return joints, (closed.shift(rollout.start) < STILL) & (loaded.shift(closed) < STILL) & loaded.stable
 
 
-def _slipping(rollout: Rollout, rng: np.random.Generator) -> Float[np.ndarray, "n n_dof"]:
-    """Joints while the object is torn away; NaN where it is not, or at once."""
+def _watched(rollout: Rollout) -> tuple[Float[np.ndarray, "n k n_dof"], Float[np.ndarray, " n"]]:
+    """Joints at ROWS times under the forces that there are, and how far the object has moved meanwhile [m]."""
+    begin = end = rollout.observe()
+    rows = [rollout.poses()[0]]
+    for _ in range(ROWS - 1):
+        end = rollout.press(rollout.targets[-1], EVERY)
+        rows.append(rollout.poses()[0])
+    return np.stack(rows, 1), end.shift(begin)
+
+
+def _slipping(rollout: Rollout, rng: np.random.Generator) -> Float[np.ndarray, "n k n_dof"]:
+    """Joints in the last moments of an object that is torn away, when it first slips; NaN where it does not."""
     begin, moment, side = rollout.observe(), rollout.moment(), _sides(rollout, rng)
-    found = np.full(rollout.poses()[0].shape, np.nan)
+    first = rollout.poses()[0]
+    found = np.full((len(first), ROWS, first.shape[1]), np.nan)
     for weights in PULLS:
         rollout.go_back(moment)
-        moved = rollout.load(rollout.targets[-1], side * weights * GRAVITY * rollout.mass[:, None], 0.15).shift(begin)
-        rows = np.isnan(found).any(1) & (moved > SLIPPED[0]) & (moved < SLIPPED[1])
-        found[rows] = rollout.poses()[0][rows]
+        rows, moved = [first] * ROWS, [np.zeros(len(first))] * ROWS
+        for _ in range(3 * ROWS):
+            state = rollout.load(rollout.targets[-1], side * weights * GRAVITY * rollout.mass[:, None], EVERY)
+            rows, moved = [*rows[1:], rollout.poses()[0]], [*moved[1:], state.shift(begin)]
+            speed = (moved[-1] - moved[ROWS // 2]) / (EVERY * (ROWS - 1 - ROWS // 2))
+            new = np.isnan(found).any((1, 2)) & (moved[-1] > SLIPPED[0]) & (moved[-1] < SLIPPED[1]) & (speed > SLIPS)
+            found[new] = np.stack(rows, 1)[new]
     return found
 
 
@@ -159,12 +185,13 @@ def judged(
     rng, table = np.random.default_rng(seed), defaultdict[tuple[str, str], Counter[str]](Counter)
     for one in found:
         unit, most = encoder * one.expected.unit, float(np.abs(one.expected.held_efforts).max())
-        joints = one.joints + unit * rng.normal(size=len(unit))
+        rows = one.watched + unit * rng.normal(size=one.watched.shape)
         efforts = one.efforts + SENSOR * most * rng.normal(size=len(unit))
         # An object that is missing from the beginning was missing before the lift, too.
         before = None if one.before is None else one.before + unit * rng.normal(size=len(unit))
-        said = check_hold(one.expected, joints, efforts if "efforts" in how else None,
-                          before=before if "twice" in how else None, config=config)
+        said = check_hold(
+            one.expected, rows[-1], efforts if "efforts" in how else None, before=before if "twice" in how else None,
+            watched=rows if "watched" in how else None, seconds=WATCHED, config=config)
         table[one.hand, one.truth][said.state] += 1
     return table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,13 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
+from dro_grasp.arm.clearing_trial import ClearTrialConfig
 from dro_grasp.arm.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
 from dro_grasp.arm.planner import PlanConfig, grasps_in_world, plan
 from dro_grasp.arm.reachability import Fault, Feasible, Postures
+from dro_grasp.arm.tabletop import TabletopConfig
 from dro_grasp.arm.workcell import Workcell
+from dro_grasp.errors import OptionError
 from dro_grasp.objects.shape import solid_of
 from tests.helpers.claw import claw_xml
 from tests.helpers.clouds import cloud_of
@@ -61,6 +65,32 @@ def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_
     assert (np.abs(wanted - before)[1:] > 0.07).all()
 
 
+@pytest.mark.parametrize("friction", [0.3, 0.5])
+def test_a_block_slides_on_a_table_that_is_tilted_beyond_the_angle_of_friction(robot: dro.Robot, friction: float) -> None:
+    """Instead of the table, gravity is tilted: the block slides where the tangent of the angle is above the coefficient."""
+    block, slid = dro.load_object("flat_box"), []
+    for factor in (0.9, 1.15):
+        scene = LiftScene(Workcell(robot), [block], friction=friction)
+        T = np.eye(4)
+        T[:3, 3] = 0.5, 0.0, -float(block.cloud[:, 2].min())
+        scene.place(0, T)
+        scene.advance(0.3)
+        start, angle = scene.pose(0)[:3, 3], math.atan(factor * friction)
+        scene.model.opt.gravity[:] = 9.81 * np.array([0.0, math.sin(angle), -math.cos(angle)])
+        scene.advance(0.4)
+        slid.append(float(np.linalg.norm(scene.pose(0)[:3, 3] - start)))
+    # From rest, along a = g (sin - mu cos).
+    angle = math.atan(1.15 * friction)
+    assert slid[0] < 1e-3
+    assert slid[1] == pytest.approx(9.81 * (math.sin(angle) - friction * math.cos(angle)) * 0.4**2 / 2, rel=0.15)
+
+
+def test_what_is_no_friction_is_refused() -> None:
+    for settings in (TabletopConfig, ClearTrialConfig, PlanConfig):
+        with pytest.raises(OptionError, match=r"friction is 0\.0; give a coefficient above 0, such as 0\.5"):
+            settings(friction=0.0)
+
+
 @pytest.fixture(scope="module")
 def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
     request = dro.GraspRequest(12, candidates=1)
@@ -86,14 +116,15 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     assert np.allclose(postures.squeeze, hand[closed.stop - 1], atol=1e-6)
     cell = Workcell(robot, (), ball)
     rehearsal = Rehearsal(cell)
-    first = rehearsal.share(chosen, postures)
-    assert first > 0
-    assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
-    assert rehearsal.share(chosen, postures) == first  # nothing is left from the one before
+    first = rehearsal.rehearse(chosen, postures)
+    assert first.share > 0
+    never = rehearsal.rehearse(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp))
+    assert (never.share, never.T_world_wrist) == (0, None)
+    assert rehearsal.rehearse(chosen, postures).share == first.share  # nothing is left from the one before
     assert planned.notes.seconds["rehearsal"] > 0
     for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
         line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
-        assert rehearsal.holds(line, postures, DEVIATIONS[0])
+        assert rehearsal.grip(line, postures, DEVIATIONS[0]) is not None
     rehearsal = Rehearsal(cell, few_contacts=12)
     seen, scene = [], rehearsal.scene
     honest = scene.advance
@@ -103,7 +134,7 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
         honest(*arguments, **options)
 
     scene.advance = advance
-    rehearsal.holds(chosen, postures, DEVIATIONS[0])
+    rehearsal.grip(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 

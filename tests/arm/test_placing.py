@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 from dro_grasp.apps.viewer.lift_page import Film
@@ -22,7 +23,7 @@ from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.placed import draw_place, measured, place_fault
 from dro_grasp.arm.placing import AWAY, SPOTS, TURNS, Place, Placing, foot, off_table, standing_turn
 from dro_grasp.arm.planner import PlanConfig, plan
-from dro_grasp.arm.reachability import Fault, Places, Reachability, ReachConfig
+from dro_grasp.arm.reachability import Fault, Places, Put, Reachability, ReachConfig
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.arm.workcell import CARRIED, Workcell, arm_addresses, robot_spec
@@ -53,7 +54,9 @@ def object_poses(robot: dro.Robot, made: MotionPlan) -> np.ndarray:
     wrist, poses = robot.T_world_wrist(made.arm.position), np.tile(np.eye(4), (len(made.stage), 1, 1))
     held = (made.stage >= ALL_STAGES.index("lift")) & (made.stage <= ALL_STAGES.index("lower"))
     first = int(held.argmax()) - 1
-    poses[held] = wrist[held] @ np.linalg.inv(wrist[first])
+    T_held = np.array(made.notes.T_world_held)
+    assert np.linalg.norm((T_held - wrist[first])[:3, 3]) < 0.03  # the object shifts little as the hand closes
+    poses[held] = wrist[held] @ np.linalg.inv(T_held)
     poses[made.stage > ALL_STAGES.index("lower")] = poses[held][-1]
     return poses
 
@@ -236,6 +239,36 @@ def test_a_grasp_that_cannot_place_is_dropped(robot: dro.Robot, standing: Standi
             np.testing.assert_allclose(found.put.moved, here, atol=3e-3)
         else:
             assert found == Fault.NO_PLACE
+
+
+def test_what_shifts_in_the_hand_is_put_where_it_shall_stand_all_the_same(
+    robot: dro.Robot, standing: Standing, placed: MotionPlan
+) -> None:
+    """By 8 mm and 3 degrees; and nothing changes for half a millimetre."""
+    obj, T = standing
+    aside, grasps = np.eye(4), plan_grasps(robot, placed)
+    aside[:2, 3] = 0.02, -0.05
+    reach = Reachability(Workcell(robot, (), obj, T), ReachConfig(), 0, Places([aside], 0.004))
+    found = reach.ways(grasps, placed.notes.chosen)
+    assert not isinstance(found, str)
+    assert found.put is not None
+    shift = np.eye(4)
+    shift[:3, :3] = Rotation.from_rotvec([0.05, 0.0, 0.02]).as_matrix()
+    shift[:3, 3] = 0.0, 0.008, 0.0
+    held = found.put.T_grasp @ shift
+    again = reach.put_as_held(found, grasps, held)
+    assert again.put is not None
+
+    def ends(put: Put) -> np.ndarray:
+        """Where the motion brings the object's corners, in the hand as it is."""
+        motion = robot.T_world_wrist(put.lower[-1]) @ np.linalg.inv(held)
+        return (obj.vertices @ T[:3, :3].T + T[:3, 3]) @ motion[:3, :3].T + motion[:3, 3]
+
+    wanted = obj.vertices @ T[:3, :3].T + T[:3, 3] + aside[:3, 3]
+    assert np.linalg.norm(ends(again.put) - wanted, axis=1).max() < 2e-3
+    assert np.linalg.norm(ends(found.put) - wanted, axis=1).max() > 7e-3
+    shift[:3, :3], shift[:3, 3] = np.eye(3), (0.0, 5e-4, 0.0)
+    assert reach.put_as_held(found, grasps, found.put.T_grasp @ shift) is found
 
 
 def plan_grasps(robot: dro.Robot, made: MotionPlan) -> dro.GraspBatch:

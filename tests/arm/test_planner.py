@@ -16,11 +16,12 @@ import torch
 import trimesh
 import yaml
 from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 import dro_grasp.arm.robot as dro_robot
 from dro_grasp.arm.motion import STAGES, MotionPlan
-from dro_grasp.arm.planner import PlanConfig, Task, plan
+from dro_grasp.arm.planner import ALIKE, ALIKE_TURN, PlanConfig, Task, failed_before, plan
 from dro_grasp.arm.robot import BUILTIN_ROBOTS
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.cli.main import main
@@ -129,6 +130,20 @@ def test_approach_and_lift_are_straight_and_stages_follow_each_other(planned: Mo
         turned = np.einsum("nij,ij->n", poses[:, :3, :3], grasp[:3, :3])
         assert (np.arccos(np.clip((turned - 1) / 2, -1, 1)) < 0.01).all()
     assert np.allclose(wrist[planned.part("close")], grasp, atol=5e-3)
+
+
+def test_grasps_like_those_that_failed_are_known_by_place_and_turn(planned: MotionPlan, robot: dro.Robot) -> None:
+    wrists = torch.from_numpy(planned.scene.T_world_wrist).float()
+    joints = torch.from_numpy(planned.scene.joints).float()
+    grasps = dro.GraspBatch.create(robot.hand, dro.load_object("can"), wrists, joints)
+    for row in range(3):
+        other = wrists[row].double().numpy()
+        apart = np.linalg.norm(planned.scene.T_world_wrist[:, :3, 3] - other[:3, 3], axis=1)
+        turned = Rotation.from_matrix(planned.scene.T_world_wrist[:, :3, :3] @ other[:3, :3].T).magnitude()
+        near = np.flatnonzero((apart < ALIKE) & (turned < ALIKE_TURN)).tolist()
+        assert row in near
+        assert failed_before(grasps, [other]) == near
+    assert failed_before(grasps, []) == []
 
 
 def test_what_was_dropped_adds_up(planned: MotionPlan) -> None:

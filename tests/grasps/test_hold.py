@@ -39,6 +39,36 @@ def test_fingers_that_move_on_together_let_the_object_slip() -> None:
     assert check_hold(EXPECTED, between(1.0), before=held).state == "empty"
 
 
+def watched(speed: np.ndarray, share: float = 0.0, noise: float = 0.003, seed: int = 0) -> np.ndarray:
+    """Eleven rows in a fifth of a second, of joints that move so fast [rad/s, or a share of the unit], with noise."""
+    time = np.linspace(-0.2, 0.0, 11)[:, None]
+    return between(share) + EXPECTED.unit * (time * speed + noise * np.random.default_rng(seed).normal(size=(11, 4)))
+
+
+def test_fingers_that_move_while_nothing_is_commanded_let_the_object_slip() -> None:
+    """Whichever way they move, wherever they are; what rests, and what creeps, is held."""
+    still, some, away = np.zeros(4), np.array([0.0, 0.4, -0.3, 0.0]), np.array([-0.5, 0.0, 0.0, 0.3])
+    for speed, share, state in ((still, 0.0, "held"), (still, 1.0, "empty"), (some, 0.0, "slipping"), (away, 0.0, "slipping"),
+                                (some, 0.6, "slipping"), (0.02 * some, 0.0, "held")):
+        right = 0
+        for seed in range(50):
+            rows = watched(speed, share, seed=seed)
+            right += check_hold(EXPECTED, rows[-1], watched=rows).state == state
+        assert right == 50, (speed, share)
+    rows = watched(some)
+    assert check_hold(EXPECTED, rows[-1]).state == "held"  # at one moment nothing shows it
+    assert check_hold(EXPECTED, rows[-1], watched=rows, seconds=20.0).state == "held"  # as slow as that
+
+
+def test_exact_encoders_and_many_joints_do_not_overflow() -> None:
+    rows = watched(np.full(4, 1e4), noise=0.0)
+    found = check_hold(EXPECTED, rows[-1], watched=rows)
+    assert found.state == "slipping"
+    assert sum(found.probabilities.values()) == pytest.approx(1)
+    rows = watched(np.zeros(4), noise=0.0)
+    assert check_hold(EXPECTED, rows[-1], watched=rows).state == "held"
+
+
 def test_the_more_open_hand_holds_something_larger() -> None:
     larger = between(-0.5)
     assert check_hold(EXPECTED, larger).state == "held"
@@ -70,6 +100,11 @@ def test_measurements_that_do_not_fit_are_refused() -> None:
             check_hold(EXPECTED, wrong)
         with pytest.raises(OptionError, match=r"measured_efforts.*hand's 4 joints"):
             check_hold(EXPECTED, EXPECTED.held_joints, wrong)
-    for settings in ({"encoder": 0.0}, {"spread": -1.0}, {"priors": (1.0, 0.0, 0.0)}):
+    for wrong in ([0.5, 0.6, 0.4, 0.02], np.zeros((3, 4)), np.zeros((11, 3)), np.full((11, 4), np.nan), [["a"]]):
+        with pytest.raises(OptionError, match="watched"):
+            check_hold(EXPECTED, EXPECTED.held_joints, watched=wrong)
+    with pytest.raises(OptionError, match="a time above 0"):
+        check_hold(EXPECTED, EXPECTED.held_joints, watched=np.zeros((11, 4)), seconds=0.0)
+    for settings in ({"encoder": 0.0}, {"slide": 0.0}, {"share": 1.0}, {"spread": -1.0}, {"priors": (1.0, 0.0, 0.0)}):
         with pytest.raises(OptionError, match="give"):
             HoldConfig(**settings)

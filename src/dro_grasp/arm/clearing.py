@@ -1,6 +1,7 @@
 """One thing after the other: look, choose, pick, drop into the bin, look again, until nothing is left on the table.
 
-What is there is what the camera sees. From one look to the next, nothing is kept but where picks have failed. Ours.
+What is there is what the camera sees. From one look to the next, nothing is kept but where picks have failed, and with which
+grasps. A pick counts when the thing is no longer seen where it was. Ours.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
+from dro_grasp.arm.parts import parted
+from dro_grasp.arm.picks import Memory, Outcome, Pick
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.table_scene import pick_object, seen_on_table
-from dro_grasp.arm.trajectory import find_path, smooth, still
+from dro_grasp.arm.table_scene import PickedObject, pick_object, seen_on_table
+from dro_grasp.arm.trajectory import find_path, smooth, standing, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
@@ -28,10 +31,10 @@ from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
-SAME = 0.04  # Farthest that a thing may be from where a pick failed to count as the same [m] (ours)
 HOME_SECONDS = 5.0  # Longest time for a path home [s] (ours)
 WALL = 0.01  # Thickness of the bin's walls [m] (ours)
 BESIDE = 0.03  # Distance from the bin within which what is seen counts as the bin [m] (ours): its walls are seen with noise
+WATCHED, EVERY = 11, 0.02  # How often joints are measured to see whether something slips, and how often [s] (ours)
 OPENING_SECONDS = 1.0  # Time in which a hand opens that holds nothing [s] (ours)
 
 
@@ -115,25 +118,13 @@ class Rig(Protocol):
 
 
 @dataclass(frozen=True)
-class Pick:
-    """What became of one pick."""
-
-    place: tuple[float, float]
-    """Where the thing stood [m]."""
-    stage: str
-    """Where it ended: see, plan, lift, carry, or done."""
-    reason: str = ""
-    """Why it failed."""
-
-
-@dataclass(frozen=True)
 class Cleared:
     """What became of a table."""
 
     picks: tuple[Pick, ...]
     """All picks, in their order."""
     left: tuple[Pick, ...]
-    """The last pick of each thing that was given up."""
+    """What is left or out of sight: the last pick of each such thing, and why it was given up."""
 
     @property
     def done(self) -> int:
@@ -154,7 +145,7 @@ def clear_table(
         predictor: Proposes grasps; the default weights if omitted.
         config: Where the bin is, and how often is tried.
         seed: Of all plans.
-        progress: Called after each pick.
+        progress: Called after each pick, once the camera has looked again where something moved.
         judged: Called with each judgement of whether the hand holds something, when it is made.
 
     Raises:
@@ -165,90 +156,135 @@ def clear_table(
     if robot.table is None or robot.camera is None:
         raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
                           "file: what is to be cleared has to be seen on one")
-    picks, failed = list[Pick](), list[Pick]()
-    while len(picks) < config.most:
-        scene, things = _things(robot, rig, config.bin)
-        left = sorted((thing for thing in things if len(_near(failed, thing.place)) < config.tries),
-                      key=lambda thing: len(_near(failed, thing.place)))  # the rest of the order is that of things
-        if not left:
-            return Cleared(tuple(picks), tuple(_near(failed, thing.place)[-1] for thing in things))
-        assert scene is not None  # where something is left
-        for thing in left:  # until something moves, and what was seen is no longer true
-            pick = _pick(robot, rig, scene, thing, predictor, config, seed + len(picks), judged)
-            picks.append(pick)
-            failed += [pick] if pick.reason else []
-            if progress is not None:
-                progress(pick)
-            if pick.stage not in ("see", "plan") or len(picks) == config.most:
+    memory, picks, moved = Memory(config.tries), list[Pick](), None
+    tell = progress or (lambda pick: None)
+    while True:
+        look = _look(robot, rig, config.bin)
+        if moved is not None:
+            picks[-1] = memory.see(moved, look.points, list(look.spots))
+            tell(picks[-1])
+            moved = None
+        left = memory.left(list(look.spots))
+        if not left or len(picks) >= config.most:
+            return Cleared(tuple(picks), memory.given_up(list(look.spots)))
+        for place in left:  # until something moves, and what was seen is no longer true
+            made = _pick(robot, rig, look, place, predictor, config, seed + len(picks), judged, memory.wrists(place))
+            picks.append(made.pick)
+            if made.pick.stage not in ("see", "plan"):
+                moved = made
                 break
-    return Cleared(tuple(picks), tuple(failed))
+            memory.note(made)
+            tell(made.pick)
+            if len(picks) >= config.most:
+                break
 
 
-class _Thing(NamedTuple):
-    """What stands on the table."""
+class _Look(NamedTuple):
+    """What the camera sees outside the bin."""
 
-    place: tuple[float, float]  # the middle of what was seen of it [m]
-    spot: Float[np.ndarray, "3"]  # a point of it [m]
+    points: Float[np.ndarray, "n 3"]  # in the world [m]
+    scene: Scene | None  # None where there is nothing
+    spots: dict[tuple[float, float], Float[np.ndarray, "3"]]
+    """A point of each thing, by the middle of what was seen of it [m]; those that have most room come first."""
 
 
-def _things(robot: Robot, rig: Rig, bin: Bin) -> tuple[Scene | None, list[_Thing]]:
-    """What the camera sees outside the bin, and the things there, those first that have most room."""
+def _look(robot: Robot, rig: Rig, bin: Bin) -> _Look:
+    """What is on the table now."""
     assert robot.camera is not None
     T, points = robot.camera.T_world_camera, rig.look()
-    points = points[~bin.holds(points @ T[:3, :3].T + T[:3, 3], BESIDE)]
+    world = points @ T[:3, :3].T + T[:3, 3]
+    outside = ~bin.holds(world, BESIDE)
     try:
-        scene = seen_on_table(load_scene(points, "thing", camera=robot.camera.as_seen()), robot)
+        scene = seen_on_table(load_scene(points[outside], "thing", camera=robot.camera.as_seen()), robot)
     except ObjectError:
-        return None, []
-    world, labels = scene.points_seen(), scene.segments.labels
-    places = np.array([world[labels == k, :2].mean(0) for k in range(scene.segments.count)]).reshape(-1, 2)
+        return _Look(world[outside], None, {})
+    seen, labels = scene.points_seen(), scene.segments.labels
+    places = np.array([seen[labels == k, :2].mean(0) for k in range(scene.segments.count)]).reshape(-1, 2)
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
     order = (-apart.min(1, initial=np.inf)).argsort(kind="stable")
-    return scene, [_Thing((float(places[k, 0]), float(places[k, 1])), scene.spot(int(k))) for k in order]
-
-
-def _near(picks: Sequence[Pick], place: tuple[float, float]) -> list[Pick]:
-    return [pick for pick in picks if np.hypot(pick.place[0] - place[0], pick.place[1] - place[1]) < SAME]
+    return _Look(world[outside], scene, {(float(places[k, 0]), float(places[k, 1])): scene.spot(int(k)) for k in order})
 
 
 def _pick(
-    robot: Robot, rig: Rig, scene: Scene, thing: _Thing, predictor: GraspPredictor,
-    config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None,
-) -> Pick:
-    """Pick the thing at a place and drop it into the bin; the arm is at home afterwards."""
-    place = thing.place
+    robot: Robot, rig: Rig, look: _Look, place: tuple[float, float], predictor: GraspPredictor,
+    config: ClearConfig, seed: int, judged: Callable[[HoldCheck], None] | None, avoid: Sequence[Float[np.ndarray, "4 4"]],
+) -> Outcome:
+    """Pick the thing at a place and drop it into the bin; the arm is at home afterwards.
+
+    Grasps near those to avoid are not tried again, and then, or where there is no plan for it all, its parts are.
+    """
+    assert look.scene is not None  # where something was seen
     try:
-        seen = pick_object(scene, robot, thing.spot)
+        seen = pick_object(look.scene, robot, look.spots[place])
     except DroGraspError as error:
-        return Pick(place, "see", str(error))
+        return Outcome(Pick(place, "see", str(error)))
+    reasons = list[str]()
+    for part in [*parted(seen), seen] if avoid else [seen, *parted(seen)]:
+        try:
+            made = _planned(part, predictor, config, seed, avoid)
+        except DroGraspError as error:
+            reasons.append(str(error))
+            continue
+        return _carry_out(robot, rig, part, place, made, config, judged)
+    return Outcome(Pick(place, "plan", reasons[-1 if avoid else 0]))  # that of it all
+
+
+def _planned(
+    seen: PickedObject, predictor: GraspPredictor, config: ClearConfig, seed: int, avoid: Sequence[Float[np.ndarray, "4 4"]]
+) -> MotionPlan:
+    """A motion that drops a thing into the bin, or a PlanError."""
+    assert seen.robot.table is not None
+    (x, y), height = config.bin.centre, config.bin.height
+    above = Place((x, y, seen.robot.table.height + height + config.drop), falls=height + config.drop)
+    return plan(seen.robot, seen.obj, obstacles=[*seen.obstacles, config.bin.walls(seen.robot.table.height)],
+                predictor=predictor, config=config.plan, seed=seed, place=above, avoid=avoid)
+
+
+def _carry_out(
+    robot: Robot, rig: Rig, seen: PickedObject, place: tuple[float, float], made: MotionPlan, config: ClearConfig,
+    judged: Callable[[HoldCheck], None] | None,
+) -> Outcome:
+    """Follow a plan to the bin; what slips as it is lifted is put back, and what is lost is left where it fell."""
     assert seen.robot.table is not None
     around = [*seen.obstacles, config.bin.walls(seen.robot.table.height)]
-    x, y = config.bin.centre
-    above = Place((x, y, seen.robot.table.height + config.bin.height + config.drop), falls=config.bin.height + config.drop)
-    try:
-        made = plan(seen.robot, seen.obj, obstacles=around, predictor=predictor, config=config.plan, seed=seed, place=above)
-    except DroGraspError as error:
-        return Pick(place, "plan", str(error))
-    for stages, stage in ((STAGES, "lift"), (PLACING[:1], "carry")):
+    cloud = seen.obj.cloud if seen.obj.seen is None else seen.obj.seen
+    pick = Pick(place, "done")
+    for stages in (STAGES, PLACING[:1]):
         _follow(rig, made, stages)
-        check = made.check_hold(rig.joints()[1])
+        check = _judge(rig, made, stages[-1])
         if judged is not None:
             judged(check)
-        if check.state != "held":
+        if check.state == "empty" or (check.state == "slipping" and stages is STAGES):
+            if check.state == "slipping":
+                _follow(rig, made, ("lift",), back=True)
             _open(rig, robot)
             _go_home(rig, Workcell(seen.robot, [*around, seen.obj]))
-            return Pick(place, stage, f"the hand is {check.state}, by its joints")
-    _follow(rig, made, PLACING[1:])
+            pick = Pick(place, stages[-1], f"the hand is {check.state}, by its joints")
+            return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
+    _follow(rig, made, PLACING[1:])  # what slips above the bin may do so
     _go_home(rig, Workcell(seen.robot, around))
-    return Pick(place, "done")
+    return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
 
 
-def _follow(rig: Rig, made: MotionPlan, stages: Sequence[str]) -> None:
-    """Follow some stages of a plan, which follow each other."""
+def _judge(rig: Rig, made: MotionPlan, stage: str) -> HoldCheck:
+    """Whether the hand holds something at the end of a stage, by its joints as they are and as they move."""
+    row, rows = made.part(stage).stop - 1, [rig.joints()[1]]
+    for _ in range(WATCHED - 1):
+        rig.move(standing(made.arm.position[row], EVERY), standing(made.hand.position[row], EVERY))
+        rows.append(rig.joints()[1])
+    return made.check_hold(rows[-1], watched=np.stack(rows), seconds=EVERY * (WATCHED - 1))
+
+
+def _follow(rig: Rig, made: MotionPlan, stages: Sequence[str], back: bool = False) -> None:
+    """Follow some stages of a plan, which follow each other, or go back along them."""
     rows = slice(made.part(stages[0]).start, made.part(stages[-1]).stop)
     arm, hand = (Trajectory(part.time[rows] - part.time[rows][0], part.position[rows], part.velocity[rows],
                             part.acceleration[rows]) for part in (made.arm, made.hand))
-    rig.move(arm, hand)
+    rig.move(*(_reversed(arm), _reversed(hand)) if back else (arm, hand))
+
+
+def _reversed(way: Trajectory) -> Trajectory:
+    return Trajectory(way.time[-1] - way.time[::-1], way.position[::-1], -way.velocity[::-1], way.acceleration[::-1])
 
 
 def _open(rig: Rig, robot: Robot) -> None:
@@ -261,14 +297,20 @@ def _open(rig: Rig, robot: Robot) -> None:
 
 
 def _go_home(rig: Rig, cell: Workcell) -> None:
-    """Bring the arm home, clear of what was seen, with the hand open.
+    """Bring the arm home with the hand open, clear of what was seen, where it can.
 
     Raises:
         PlanError: There is no path.
     """
     robot = cell.robot
     arm, opened = rig.joints()[0], robot.open_hand
-    found = find_path(arm, robot.home[None], lambda q: cell.free(q, opened), *robot.working_range, HOME_SECONDS, 0)
+    found = None
+    for around in (cell, Workcell(robot)):  # what it touches where it is may be noise, or may give way
+        def free(q: Float[np.ndarray, " n_arm"], around: Workcell = around) -> bool:
+            return around.free(q, opened)
+
+        if (found := find_path(arm, robot.home[None], free, *robot.working_range, HOME_SECONDS, 0)) is not None:
+            break
     if found is None:
         met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
         raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")

@@ -16,7 +16,7 @@ from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.table_setup import Region, scatter
 from dro_grasp.arm.tabletop import TabletopConfig, Watcher
 from dro_grasp.arm.workcell import Workcell
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.scan import depth_points
@@ -115,10 +115,20 @@ def clear_trial(
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
     rig = SimulatedRig(scene, config.noise, seed + 1000 * number, watch)
     judgements = list[tuple[str, bool]]()
-    cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, progress,
-                    lambda check: judgements.append((check.state, rig.holds())))
+    picks, reason = list[Pick](), ""
+
+    def picked(pick: Pick) -> None:
+        picks.append(pick)
+        if progress is not None:
+            progress(pick)
+
+    try:
+        cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, picked,
+                              lambda check: judgements.append((check.state, rig.holds())))
+    except PlanError as error:  # as on a robot, a person has to help; what is removed counts
+        cleared, reason = Cleared(tuple(picks), ()), str(error)
     scene.advance(1.0)
     centres = [(T[:3, :3] @ obj.centre_of_mass + T[:3, 3])[None] for i, obj in enumerate(objects) for T in [scene.pose(i)]]
     fallen = tuple(bool(centre[0, 2] < table.height - LOW) for centre in centres)
     removed = tuple(bool(config.clear.bin.holds(centre)[0]) and not fell for centre, fell in zip(centres, fallen, strict=True))
-    return ClearTrial(names, removed, fallen, cleared, tuple(judgements))
+    return ClearTrial(names, removed, fallen, cleared, tuple(judgements), reason)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from dro_grasp.arm.drivers import Drivers
 from dro_grasp.arm.placing import foot
+from dro_grasp.arm.robot import Robot
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
@@ -102,6 +103,9 @@ class PlanNotes:
     """Likewise."""
     hold: dict[str, tuple[float, ...]] | None = None
     """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
+    T_world_held: list[list[float]] | None = None
+    """Where the wrist would have taken hold of an object that does not shift as the hand closes, to have it in the hand as it
+    is, by the rehearsal [m]; None in plans without a place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +150,11 @@ class MotionPlan:
         """The hand's joints while it holds the object [rad or m]."""
         return self.hand.position[self.part("lift")][-1]
 
+    def held_from(self, robot: Robot) -> Float[np.ndarray, "4 4"]:
+        """Wrist pose relative to which the hand carries the object [m]: that of the grasp, or `T_world_held`."""
+        told = self.notes.T_world_held
+        return robot.T_world_wrist(self.arm.position[self.part("lift")][0]) if told is None else np.array(told)
+
     @property
     def drivers(self) -> tuple[Drivers, Drivers]:
         """How the drivers of the arm and of the hand count joints."""
@@ -161,7 +170,10 @@ class MotionPlan:
         known = self.notes.hold
         return None if known is None else HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS))
 
-    def check_hold(self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None) -> HoldCheck:
+    def check_hold(
+        self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *, before: ArrayLike | None = None,
+        watched: ArrayLike | None = None, seconds: float = 0.2,
+    ) -> HoldCheck:
         """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
 
         Raises:
@@ -170,7 +182,7 @@ class MotionPlan:
         """
         if (expected := self.hold) is None:
             raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
-        return check_hold(expected, measured_joints, measured_efforts)
+        return check_hold(expected, measured_joints, measured_efforts, before=before, watched=watched, seconds=seconds)
 
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""

@@ -233,6 +233,15 @@ def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:
         servo.forcelimited, servo.forcerange = True, [-effort, effort]
 
 
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """What became of one grasp."""
+
+    share: float  # Of the rehearsals in which the object is held
+    T_world_wrist: Float[np.ndarray, "4 4"] | None
+    """Where the wrist would be, did the object stay in place while it shifts in the hand [m]; None where it was lost."""
+
+
 class Rehearsal:
     """Lifts one object again and again."""
 
@@ -253,14 +262,18 @@ class Rehearsal:
         self._gravity = self.scene.model.opt.gravity.copy()
         self._friction = self.scene.model.geom_friction.copy()
 
-    def share(self, goal: Feasible, hand: Postures) -> float:
-        """Share of the rehearsals in which the object is held; one that drops it where it is thought to be is the last."""
-        if not self.holds(goal, hand, self.deviations[0]):
-            return 0.0
-        return (1 + sum(self.holds(goal, hand, deviation) for deviation in self.deviations[1:])) / len(self.deviations)
+    def rehearse(self, goal: Feasible, hand: Postures) -> Rehearsed:
+        """All rehearsals of one grasp; one that drops the object where it is thought to be is the last."""
+        if (T_wrist_object := self.grip(goal, hand, self.deviations[0])) is None:
+            return Rehearsed(0.0, None)
+        held = 1 + sum(self.grip(goal, hand, deviation) is not None for deviation in self.deviations[1:])
+        return Rehearsed(held / len(self.deviations), self.T_world_object @ np.linalg.inv(T_wrist_object))
 
-    def holds(self, goal: Feasible, hand: Postures, deviation: Deviation) -> bool:
-        """Approach over 3 cm, close, lift by 8 cm and hold, once. The hand closes as in trials; other numbers are ours."""
+    def grip(self, goal: Feasible, hand: Postures, deviation: Deviation) -> Float[np.ndarray, "4 4"] | None:
+        """Approach over 3 cm, close, lift by 8 cm and hold, once: where the object is in the wrist's frame [m]; None if lost.
+
+        The hand closes as in trials; other numbers are ours.
+        """
         scene, start = self.scene, self.T_world_object.copy()
         start[:2, 3] += deviation.shift
         scene.model.opt.gravity[:] = deviation.weight * self._gravity
@@ -272,15 +285,15 @@ class Rehearsal:
         self._follow(approach[-1:], hand.closing, 1.0)
         self._follow(approach[-1:], hand.squeeze[None], 0.3)
         if scene.touched(0) < FEWEST_LINKS:
-            return False
+            return None
         rows = self._within(goal.lift, 0.08)
         self._follow(rows, hand.squeeze[None], 0.7)
         risen, grip = scene.pose(0)[2, 3] - start[2, 3], scene.in_hand(0)
         if risen < self._lengths(rows)[-1] / 2:
-            return False
+            return None
         self._follow(rows[-1:], hand.squeeze[None], 0.3)
         slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
-        return bool(slip < 0.02) and scene.touched(0) >= FEWEST_LINKS
+        return scene.in_hand(0) if slip < 0.02 and scene.touched(0) >= FEWEST_LINKS else None
 
     def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:
         """The first configurations of a straight line, and one step of it at least."""

@@ -49,6 +49,7 @@ Directions = Literal["paper", "all"]  # Palm directions that are asked for
 ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
 BASE_ROOM = 0.15  # Distance of its edge from the middle of the arm's base, where that is possible [m] (ours)
 SURROUNDS = 0.1  # Least distance of its edge from what stands on it [m] (ours)
+ALIKE, ALIKE_TURN = 0.03, 0.5  # Distance [m] and angle [rad] within which a grasp is like one that failed (ours)
 PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 
@@ -121,7 +122,7 @@ def plan(
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
     start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
-    place: Sequence[float] | str | Place | None = None,
+    place: Sequence[float] | str | Place | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
 ) -> MotionPlan:
     """A motion that grasps the object and lifts it, and puts it down where that is asked for.
 
@@ -138,6 +139,7 @@ def plan(
         place: Where to put it, and let it go: x, y, z of the middle of its foot in the world [m], and a turn about the vertical
             [rad], any if that is left out; or "table" or the name of an obstacle, where a place is chosen. It stands there as
             it stands now, or as its mesh stands stably.
+        avoid: Wrist poses in the world of grasps that failed [m]; those near them are not tried again.
 
     Raises:
         PlanError: The object or an obstacle collides with the robot at the start, the object lies below the table, the place is
@@ -151,7 +153,7 @@ def plan(
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
     wanted = place if place is None or isinstance(place, Place) else Place.of(place)
-    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted)
+    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted, avoid)
     task.check_start()
     tries = Tries()
     for batch, last in candidates(task, tries, grasps, predictor):
@@ -182,12 +184,13 @@ class Task:
     seed: int
     start: Float[np.ndarray, " n_arm"]  # Of the arm [rad or m]
     place: Place | None = None
+    avoid: Sequence[Float[np.ndarray, "4 4"]] = ()
 
     @staticmethod
     def of(
         robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
-        place: Place | None = None,
+        place: Place | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
         obj, T = upright(obj, T_world_object)
@@ -198,7 +201,8 @@ class Task:
             obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
         first = robot.home if start is None else robot.require_start(start)
         return Task(
-            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place)
+            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place,
+            avoid)
 
     @property
     def robot(self) -> Robot:
@@ -343,6 +347,8 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
                     tries.dropped.setdefault(first + row, reason)
         for row, reason in task.reach.hopeless(grasps).items():
             tries.dropped.setdefault(first + row, reason)
+        for row in failed_before(grasps, task.avoid):
+            tries.dropped.setdefault(first + row, Fault.FAILED)
     tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
     tries.waiting += [goal.index for goal in tries.ready]
     tries.ready = []
@@ -351,6 +357,16 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     else:
         score = tries.grasps.score.tolist()
         tries.waiting.sort(key=lambda i: -score[i])
+
+
+def failed_before(grasps: GraspBatch, avoid: Sequence[Float[np.ndarray, "4 4"]]) -> list[int]:
+    """Rows of grasps in the world whose wrists are near one of these poses."""
+    T = grasps.T_object_wrist.double().numpy()
+    near = np.zeros(len(T), bool)
+    for other in avoid:
+        cosine = (np.einsum("nij,ij->n", T[:, :3, :3], other[:3, :3]) - 1) / 2
+        near |= (np.linalg.norm(T[:, :3, 3] - other[:3, 3], axis=1) < ALIKE) & (cosine > math.cos(ALIKE_TURN))
+    return np.flatnonzero(near).tolist()
 
 
 def reachable(task: Task, tries: Tries) -> Iterator[Feasible]:
@@ -374,7 +390,11 @@ def rehearsed(task: Task, tries: Tries, found: Iterator[Feasible]) -> list[Feasi
         if task.rehearsal is not None and goal.index not in tries.share:
             count += 1
             with tries.watch("rehearsal"):
-                tries.share[goal.index] = task.rehearsal.share(goal, Postures.of(task.robot, grasps, goal.index))
+                done = task.rehearsal.rehearse(goal, Postures.of(task.robot, grasps, goal.index))
+            tries.share[goal.index] = done.share
+            if task.place is not None and not task.place.falls and done.T_world_wrist is not None:
+                with tries.watch("reach"):
+                    goal = tries.found[goal.index] = task.reach.put_as_held(goal, grasps, done.T_world_wrist)
         share = tries.share.get(goal.index)
         if share == 0:
             tries.lost.append(goal)
@@ -438,7 +458,7 @@ def carry_path(task: Task, goal: Feasible, hand: Postures, seed: int) -> Float[n
     """Waypoints with the object in the hand, from the end of the lift to above its place; None if none is found."""
     robot, cell = task.robot, task.cell
     assert goal.put is not None
-    T_grasp = robot.T_world_wrist(goal.approach[-1])
+    T_grasp = goal.put.T_grasp
 
     def free(q: Float[np.ndarray, " n_arm"]) -> bool:
         return cell.free(q, hand.squeeze, moved=carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=CARRIED)
@@ -466,7 +486,8 @@ def _described(
         None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
         scales=None if robot.drivers.are_usual else robot.drivers.scales,
-        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS})
+        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS},
+        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist())
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

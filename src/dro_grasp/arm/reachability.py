@@ -30,6 +30,8 @@ LOWERED = 0.08  # Height from which an object is lowered straight [m] (ours)
 LEAST_OPEN = 0.5  # Least share of the way from grasp to pregrasp that the hand opens, where others stand in its way (ours)
 PLACE_SEEDS = 4  # Starts of inverse kinematics at a place: the end of the lift, the grasp, home, and random ones (ours)
 TILTED = 1e-3  # Deeper than a place allows that an object may be in a surface [m]: what inverse kinematics leaves open (ours)
+SHIFTED = 0.002  # Least distance by which an object that shifts in the hand is put down otherwise [m] (ours)
+ROTATED = 0.03  # Least rotation likewise, as the norm of a matrix's change: 1.2 degrees (ours)
 STEEPEST = 0.2  # Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below
 
 
@@ -44,6 +46,7 @@ class Fault(StrEnum):
     NO_LINE = "without a straight approach"
     NO_LIFT = "without a straight lift"
     NO_PLACE = "without a way to put it there"
+    FAILED = "like one that failed before"
     LOSES = "losing the object when rehearsed"
     NO_PATH = "without a path"  # to any of the goals, or the timed motion would touch something
 
@@ -84,6 +87,8 @@ class Put:
     lower: Float[np.ndarray, "k n_arm"]  # From above the place down to it [rad or m]
     retreat: Float[np.ndarray, "m n_arm"]  # From there back [rad or m]
     released: Float[np.ndarray, " n_dof"]  # The hand on its way back [rad or m]
+    T_grasp: Float[np.ndarray, "4 4"]
+    """Where the wrist was as it took hold of the object, or would have been, had the object not shifted in the hand [m]."""
     kept: float  # Distance that the object keeps from its surroundings while it is put down, negative within them [m]
 
 
@@ -174,7 +179,10 @@ class Reachability:
             outcome = self._through(q, back, up, postures)
             if not isinstance(outcome, str):
                 found = Feasible(index, *outcome)
-                return found if self.places is None else self._with_place(found, ahead, postures)
+                if self.places is None:
+                    return found
+                put = self._way_to_place(found, robot.T_world_wrist(found.approach[-1]), T[:3, :3].T @ ahead, postures)
+                return Fault.NO_PLACE if put is None else replace(found, put=put)
             reasons.append(outcome)
         return max(reasons, key=(Fault.OUT_OF_REACH, Fault.COLLIDES, Fault.NO_LINE, Fault.NO_LIFT).index)
 
@@ -197,19 +205,37 @@ class Reachability:
             return Fault.NO_LIFT
         return retreat[::-1].copy(), raised
 
-    def _with_place(self, found: Feasible, ahead: Float[np.ndarray, "3"], hand: Postures) -> Feasible | str:
-        """The same with a way to put the object down at the first place that it leads to; `ahead` is the palm's direction."""
+    def put_as_held(self, found: Feasible, grasps: GraspBatch, T_grasp: Float[np.ndarray, "4 4"]) -> Feasible:
+        """The same grasp, with the object put down as it is in the hand once that has closed; as before if there is no way.
+
+        Args:
+            found: With a way to a place.
+            grasps: Its batch.
+            T_grasp: Where the wrist would have been, had the object not shifted [m], from a rehearsal.
+        """
+        assert found.put is not None
+        shift = np.linalg.inv(found.put.T_grasp) @ T_grasp
+        if np.linalg.norm(shift[:3, 3]) < SHIFTED and np.linalg.norm(shift[:3, :3] - np.eye(3)) < ROTATED:
+            return found
+        T = grasps.T_object_wrist[found.index:found.index + 1]
+        ahead = (T[0, :3, :3].T @ self.cell.robot.hand.palm_directions(T)[0]).double().numpy()
+        put = self._way_to_place(found, T_grasp, ahead, Postures.of(self.cell.robot, grasps, found.index))
+        return found if put is None else replace(found, put=put)
+
+    def _way_to_place(
+        self, found: Feasible, T_grasp: Float[np.ndarray, "4 4"], ahead: Float[np.ndarray, "3"], hand: Postures
+    ) -> Put | None:
+        """A way to put the object down at the first place that there is one to; `ahead` is the palm's, in the wrist's frame."""
         assert self.places is not None
         robot, (lower, upper) = self.cell.robot, self.cell.robot.working_range
-        T_grasp = robot.T_world_wrist(found.approach[-1])
         draws = self.random.uniform(lower, upper, (PLACE_SEEDS - 3, len(lower)))
         for moved in self.places.motions:
-            turned = moved[:3, :3] @ ahead
+            turned = moved[:3, :3] @ T_grasp[:3, :3] @ ahead
             for seed in [found.lift[-1], found.approach[-1], robot.home, *draws]:
                 q = self.solver.solve(moved @ T_grasp, [seed])
                 if q is not None and (put := self._put(q, T_grasp, turned, hand)) is not None:
-                    return replace(found, put=put)
-        return Fault.NO_PLACE
+                    return put
+        return None
 
     def _put(
         self, q: Float[np.ndarray, " n_arm"], T_grasp: Float[np.ndarray, "4 4"], ahead: Float[np.ndarray, "3"], hand: Postures
@@ -235,7 +261,7 @@ class Reachability:
         opening = np.linspace(0, 1, 5)[:, None] * (hand.opened - released) + released
         gone = all(free(x, released, clearance, moved, touch=True, kept=kept) for x in retreat) and all(
             free(retreat[-1], shape, clearance, moved, kept=kept) for shape in opening)
-        return Put(moved, raised[::-1].copy(), retreat, released, kept) if gone else None
+        return Put(moved, raised[::-1].copy(), retreat, released, T_grasp, kept) if gone else None
 
     def _released(
         self, q: Float[np.ndarray, " n_arm"], moved: Float[np.ndarray, "4 4"], hand: Postures, kept: float

@@ -108,7 +108,7 @@ def timed_stages(
         return None
     placing: list[Pair] | None = []
     if carry is not None and goal.put is not None:
-        placing = _placing(cell, carry, cell.robot.T_world_wrist(goal.approach[-1]), goal.put, hand)
+        placing = _placing(cell, carry, goal.put, hand)
         if placing is None:
             return None
     arms, hands = zip(*lifting, *placing, strict=True)
@@ -150,9 +150,9 @@ def _lifting(
 
 
 def _placing(
-    cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], T_grasp: Float[np.ndarray, "4 4"], put: Put, hand: Postures
+    cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], put: Put, hand: Postures
 ) -> list[Pair] | None:
-    """The stages PLACING, with the object that the hand took hold of with its wrist at a pose [m]; None if it hits something.
+    """The stages PLACING, with the object in the hand; None if it hits something.
 
     The object is set down slowly, and the hand opens slowly: what is let go in a jerk tips over.
     """
@@ -162,7 +162,7 @@ def _placing(
     fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
 
     def clear(way: Trajectory, kept: float) -> bool:
-        return all(cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), T_grasp), touch=True, kept=kept)
+        return all(cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), put.T_grasp), touch=True, kept=kept)
                    for q in way.position)
 
     carry = smooth(waypoints, *gentle, STEP)

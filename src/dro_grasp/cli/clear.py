@@ -22,7 +22,8 @@ VIDEO_RATE = 2.5  # Pictures for each simulated second: the animation is four ti
 class Clear:
     """Let a robot clear its table into a bin, one thing after the other, in MuJoCo. Needs the extra `[arm]`.
 
-    It looks, picks what has most room, checks by its joints whether it holds, drops it into the bin, and looks again.
+    It looks, picks what has most room, checks by its joints whether it holds, drops it into the bin, and looks again. What it
+    loses it tries again with another grasp.
 
     Example: dro-grasp clear --robot xarm7_leaphand --objects mug can bottle --output tables.jsonl --video clear.webp
     """
@@ -112,9 +113,11 @@ class Clear:
                         "judgements": len(judged), "right": right, "results": done})
             return
         rows = [[i, f"{sum(table['removed'])} of {len(table['objects'])}", len(table["cleared"]["picks"]),
-                 "; ".join(pick["reason"] for pick in table["cleared"]["left"])[:120] or table["reason"]]
-                for i, table in enumerate(done)]
-        print_table("tables", ["table", "removed", "picks", "given up because"], rows)
+                 len(table["cleared"]["left"]), table["reason"]] for i, table in enumerate(done)]
+        print_table("tables", ["table", "removed", "picks", "given up", "ended by"], rows)
+        for i, table in enumerate(done):
+            for pick in table["cleared"]["left"]:
+                say(f"table {i}, thing at ({pick['place'][0]:.2f}, {pick['place'][1]:.2f}) m: {pick['reason']}")
         say(f"{removed} of {things} things removed ({removed / things:.0%}, 95 % interval {low:.0%} to {high:.0%})"
             + (f", with {picks / removed:.2f} picks each" if removed else ""))
         if judged:

@@ -1,7 +1,8 @@
 """Did it hold? What a robot's joints say after the hand has closed and lifted: held, empty, or slipping.
 
 Fingers that close on an object stop where it is, and press; fingers that close on nothing go on to their targets. Both ends are
-known from closings in simulation (`expect_hold`). Ours.
+known from closings in simulation (`expect_hold`). Fingers from which an object slips move while it does, and only then: whoever
+watches them for a fifth of a second sees it. Ours.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
@@ -25,6 +25,9 @@ as a radian to each joint: 1, or a length where it slides [m]."""
 HoldState = Literal["held", "empty", "slipping"]
 STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")  # In the order of HoldConfig.priors
 STEPS = 10  # Shares of the way that are tried for a slipping object (ours)
+FEWEST = 4  # Fewest rows of joints that show how fast they move (ours)
+MOST = 50.0  # Largest log-likelihood ratio of one joint (ours)
+STEADY = 1e-3  # Least noise of encoders [rad, or a share of a sliding joint's unit] (ours): no number is exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,12 @@ class HoldConfig(Checked):
     """The least such share where nobody measured before: fingers that hold may stop as far from the expected place [1]."""
     priors: tuple[float, float, float] = (0.48, 0.48, 0.04)
     """Probabilities of held, empty and slipping before anything is measured."""
+    creep: float = 0.03
+    """Standard deviation of how fast joints move of a hand that holds [rad/s, or likewise]."""
+    slide: float = 0.2
+    """The same of joints that move because an object slips."""
+    share: float = 0.5
+    """Share of the joints that do."""
 
     def __post_init__(self) -> None:
         """Refuse what is no spread and no probability.
@@ -75,11 +84,11 @@ class HoldConfig(Checked):
             OptionError: A spread is not above 0, or a probability not between 0 and 1.
         """
         super().__post_init__()
-        if not all(0 < size < math.inf for size in (self.encoder, self.sensor, self.spread)):
-            raise OptionError(f"encoder, sensor and spread are {self.encoder}, {self.sensor} and {self.spread}; give numbers "
-                              "above 0")
-        if not all(0 < prior < 1 for prior in self.priors):
-            raise OptionError(f"priors are {self.priors}; give three probabilities between 0 and 1")
+        if not all(0 < size < math.inf for size in (self.encoder, self.sensor, self.spread, self.creep, self.slide)):
+            raise OptionError(f"encoder, sensor, spread, creep and slide are {self.encoder}, {self.sensor}, {self.spread}, "
+                              f"{self.creep} and {self.slide}; give numbers above 0")
+        if not all(0 < prior < 1 for prior in (*self.priors, self.share)):
+            raise OptionError(f"priors are {self.priors} and share is {self.share}; give probabilities between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,7 @@ class HoldCheck:
 
 def check_hold(
     expected: HoldExpectation, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *,
-    before: ArrayLike | None = None, config: HoldConfig | None = None,
+    before: ArrayLike | None = None, watched: ArrayLike | None = None, seconds: float = 0.2, config: HoldConfig | None = None,
 ) -> HoldCheck:
     """Compare measured joints, and efforts if there are any, with those that are expected with the object and without.
 
@@ -108,6 +117,9 @@ def check_hold(
         measured_joints: Independent joints of the hand, in its order, (n_dof) [rad or m].
         measured_efforts: What they exert, likewise [Nm or N], positive toward larger values.
         before: Joints as they were measured while the object was held, likewise: how they moved since shows that it slips.
+        watched: Joints that were measured one after the other at even times while nothing was commanded, up to now,
+            (k, n_dof), 4 rows at least: that they move shows that it slips.
+        seconds: Time from the first to the last of these [s].
         config: Spreads.
 
     Raises:
@@ -121,9 +133,11 @@ def check_hold(
         efforts = _measured("measured_efforts", measured_efforts, size)
         noise = np.full(size, config.sensor * max(float(np.abs(expected.held_efforts).max()), 1e-9))
         total = total + _log_likelihoods(efforts, expected.held_efforts, expected.empty_efforts, noise, None, config)
-    slipping = logsumexp(total[2:]) - math.log(len(total) - 2)
+    slipping = float(np.logaddexp.reduce(total[2:])) - math.log(len(total) - 2)
+    if watched is not None:  # where fingers are says little then: a slip begins where the object is held
+        slipping = float(max(total[0], total[1])) + _moves(watched, seconds, expected.unit, config)
     odds = np.array([total[0], total[1], slipping]) + np.log(config.priors)
-    chances = np.exp(odds - logsumexp(odds)).tolist()
+    chances = np.exp(odds - np.logaddexp.reduce(odds)).tolist()
     best = max(range(len(STATES)), key=chances.__getitem__)
     return HoldCheck(STATES[best], chances[best], dict(zip(STATES, chances, strict=True)))
 
@@ -136,6 +150,25 @@ def _measured(name: str, given: ArrayLike, size: int) -> Float[np.ndarray, " n_d
     if values.shape != (size,) or not np.isfinite(values).all():
         raise OptionError(f"{name} is {values.tolist()}; give one finite number for each of the hand's {size} joints")
     return values
+
+
+def _moves(watched: ArrayLike, seconds: float, unit: Float[np.ndarray, " n_dof"], config: HoldConfig) -> float:
+    """Log-likelihood ratio of joints that a slipping object moves, to those that rest, from rows at even times."""
+    try:
+        rows = np.asarray(watched, np.float64)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"watched is no table of numbers ({error}); give a row of joints for each time") from error
+    fits = rows.ndim == 2 and len(rows) >= FEWEST and rows.shape[1] == len(unit)
+    if not (fits and np.isfinite(rows).all() and 0 < seconds < math.inf):
+        raise OptionError(f"watched has shape {rows.shape} over {seconds} s; give at least {FEWEST} rows, each of one finite "
+                          f"number for each of the hand's {len(unit)} joints, and a time above 0")
+    rows, time = rows / unit, np.linspace(-seconds / 2, seconds / 2, len(rows))
+    speed = time @ rows / (time @ time)
+    rest = rows - rows.mean(0) - time[:, None] * speed
+    noise = max(STEADY, math.sqrt(float((rest**2).sum()) / (rest.size - 2 * len(unit)))) / math.sqrt(float(time @ time))
+    still, moving = math.hypot(noise, config.creep), math.hypot(noise, config.slide)
+    ratio = np.log(still / moving) + speed**2 / 2 * (still**-2 - moving**-2)
+    return float(np.log1p(config.share * np.expm1(np.minimum(ratio, MOST))).sum())
 
 
 def _log_likelihoods(

@@ -52,7 +52,7 @@ class Film:
         wrist = robot.T_world_wrist(arm)
         stage = np.array([ALL_STAGES.index(p.stage) for p in points])
         lifts, releases = ALL_STAGES.index("lift"), ALL_STAGES.index("release")
-        start, held = robot.T_world_wrist(plan.arm.position[plan.part("lift")][0]), (stage >= lifts) & (stage < releases)
+        start, held = plan.held_from(robot), (stage >= lifts) & (stage < releases)
         poses = np.tile(np.eye(4), (len(points), 1, 1, 1))
         poses[held, 0] = np.stack([carried(T, start) for T in wrist[held]])
         if (stage >= releases).any():
