@@ -16,7 +16,8 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, settle_all, weigh_settled_all
+from dro_grasp.predict.score.holding import gives_way
+from dro_grasp.predict.settling import SettleConfig, physics, settle_all, weigh_settled_all
 from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import grasp_state, grasp_state_many
 from dro_grasp.simulation.joint_model import ABSENT, joins, joint_model
@@ -143,6 +144,16 @@ def test_settling_of_several_objects_is_that_of_each_alone(batches: list[GraspBa
         near(own.known.state.gave, other.known.state.gave, 2e-3)
         torch.testing.assert_close(found, expected, rtol=0.02, atol=1e-3, equal_nan=True)
     assert any(bool(own.stable.any()) for own in together)
+
+
+def test_without_the_removal_of_slip_the_same_grasps_give_way_on_short_pulls(batches: list[GraspBatch]) -> None:
+    rules, quick = (physics(SettleConfig(), device) for device in ("cpu", "cuda"))
+    assert rules is protocol("carry")
+    assert (rules.noslip, quick.noslip) == (2, 0)
+    slow, fast = (grasp_state_many(HAND, OBJECTS, batches, own)[0] for own in (rules, quick))
+    assert torch.equal(gives_way(slow), gives_way(fast))
+    assert 0 < int(gives_way(slow).sum()) < 9
+    assert not torch.equal(slow.gave, fast.gave)
 
 
 def test_parts_of_a_batch_have_the_objects_of_their_grasps(
