@@ -21,10 +21,11 @@ from dro_grasp.predict.settling import SettleConfig, physics, settle_all, weigh_
 from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import grasp_state, grasp_state_many
 from dro_grasp.simulation.joint_model import ABSENT, joins, joint_model
+from dro_grasp.simulation.outcome import LOST_DISTANCE
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.rollout import rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-from dro_grasp.simulation.trial import settle, settle_many
+from dro_grasp.simulation.trial import hand_shift, settle, settle_many
 from dro_grasp.simulation.weighing import WeighingConfig, weigh, weigh_many
 from dro_grasp.simulation.worlds import WARP
 from tests.helpers.loaded_hands import loaded_hand
@@ -193,11 +194,17 @@ def test_warp_steps_several_objects_as_mujoco_does_each(batches: list[GraspBatch
     """On the processor, where kernels compile for minutes the first time."""
     pytest.importorskip("mujoco_warp")
     found = settle_many(HAND, OBJECTS, batches, "strict", device=WARP)
+    held = 0
     for obj, grasps, own in zip(OBJECTS, batches, found, strict=True):
         expected = settle(HAND, obj, grasps, "strict")
-        near(own.T_object_wrist[:, :3, 3], expected.T_object_wrist[:, :3, 3], 2e-3)
-        near(own.joints, expected.joints, 0.03)
-        assert float((own.T_object_wrist - grasps.T_object_wrist).abs().max()) > 1e-3
+        moved = hand_shift(HAND, grasps, expected)
+        apart, still = hand_shift(HAND, own, expected), moved < LOST_DISTANCE
+        # What is thrown away lands elsewhere for a difference in the last digit, but not each time.
+        assert float(apart.min()) < 2e-3 < float(moved.max())
+        near(apart[still], torch.zeros_like(apart[still]), 1e-4)
+        near(own.joints[still], expected.joints[still], 2e-3)
+        held += int(still.sum())
+    assert held >= 3
 
 
 def test_a_shape_that_is_absent_takes_no_part_in_the_stand_in() -> None:
