@@ -1,39 +1,74 @@
-"""Speed-up by a second worker: the same shards made by one process and by two, including start and loading.
+"""Weak scaling of the data engine: each process has as many shards to make, however many processes there are.
 
-python -m lab.benchmarks.workers [--json]
+Shards are small, so that what it costs to hand them out shows: the CPU time of the process that does, with that which joins a
+cluster for it, the files, and their bytes. Start and loading of the workers are within the time.
+
+    python -m lab.benchmarks.workers [--processes 1 2 4] [--shards 6] [--engine local|ray] [--json]
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 import tempfile
+import time
 from pathlib import Path
 
-from dro_grasp.training.data.engine.schedule import DatasetReport, synthesize_dataset
-from dro_grasp.training.data.engine.worker import EngineConfig
+from dro_grasp.objects.catalogue import resolve_objects
+from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.training.data.engine.pools import Pool, RayPool
+from dro_grasp.training.data.engine.schedule import synthesize_dataset
+from dro_grasp.training.data.engine.worker import EngineConfig, Job
 from lab.benchmarks.report import emit
-from lab.benchmarks.synthesis import HANDS
 
-OBJECTS = ("sphere", "can", "bottle", "mug")
-"""Built-in objects, one shard for each hand; their geometry is in the cache after the first run."""
+HAND = "gripper3"
+SMALL = EngineConfig(candidates=32, max_barren_rounds=1, synthesis=SynthesisConfig(steps=20))
+"""Shards of a second or two."""
+COLUMNS = ("processes", "shards", "time [s]", "shards a second", "efficiency", "CPU of the head [ms a shard]", "files",
+           "bytes a shard")
 
 
-def run(workers: int) -> DatasetReport:
-    """One shard of every pair."""
+def run(processes: int, shards: int, engine: str) -> list[float]:
+    """One shard of so many pairs for each process: shards, time, CPU time of this process, files, and bytes."""
+    objects = resolve_objects(["builtin:train", f"procedural:0-{processes * shards}"])[: processes * shards]
+
+    def pool(job: Job) -> Pool:
+        return RayPool(job, processes, job.config.shard_seconds)
+
     with tempfile.TemporaryDirectory() as folder:
-        return synthesize_dataset(HANDS, OBJECTS, 1, Path(folder) / "data", workers, config=EngineConfig(max_barren_rounds=1))
+        begin, used = time.perf_counter(), head_seconds(engine)
+        report = synthesize_dataset(
+            [HAND], objects, 1, Path(folder) / "data", pool if engine == "ray" else processes, config=SMALL)
+        seconds, used = time.perf_counter() - begin, head_seconds(engine) - used
+        files = [file for file in Path(folder).rglob("*.parquet") if file.is_file()]
+        return [report.shards, seconds, used, len(files), sum(file.stat().st_size for file in files)]
+
+
+def head_seconds(engine: str) -> float:
+    """CPU time so far of this process, and of that which joined a cluster; workers of a local pool are no part of the head."""
+    spent = os.times()
+    return spent.user + spent.system + (spent.children_user + spent.children_system if engine == "ray" else 0.0)
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--processes", nargs="+", type=int, default=[1, 2, 4])
+    parser.add_argument("--shards", type=int, default=6, help="of each process")
+    parser.add_argument("--engine", choices=("local", "ray"), default="local")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    run(2)
-    reports = {workers: run(workers) for workers in (1, 2)}
-    rows = [[n, r.shards, r.grasps, r.seconds, reports[1].seconds / r.seconds] for n, r in reports.items()]
-    emit("The same shards by one worker and by two", rows, ["workers", "shards", "grasps", "time [s]", "times faster"],
-         {"speedup_of_two": reports[1].seconds / reports[2].seconds}, options.json)
+    run(1, options.shards * max(options.processes), options.engine)  # convex parts and grids come to the cache
+    rows: list[list[float]] = []
+    for processes in options.processes:
+        shards, seconds, used, files, size = run(processes, options.shards, options.engine)
+        speed = shards / seconds
+        base = rows[0][3] / rows[0][0] if rows else speed / processes
+        rows.append([processes, shards, seconds, speed, speed / processes / base, 1e3 * used / shards, files, size / shards])
+        print(*rows[-1], file=sys.stderr, flush=True)
+    emit(f"Weak scaling by {options.engine} processes", rows, COLUMNS,
+         {"rows": [dict(zip(COLUMNS, row, strict=True)) for row in rows]}, options.json)
 
 
 if __name__ == "__main__":

@@ -16,14 +16,16 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, settle_all, weigh_settled_all
+from dro_grasp.predict.score.holding import gives_way
+from dro_grasp.predict.settling import SettleConfig, physics, settle_all, weigh_settled_all
 from dro_grasp.simulation import rollout as rollout_module, warp_worlds
 from dro_grasp.simulation.grasp_state import grasp_state, grasp_state_many
 from dro_grasp.simulation.joint_model import ABSENT, joins, joint_model
+from dro_grasp.simulation.outcome import LOST_DISTANCE
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.rollout import rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-from dro_grasp.simulation.trial import settle, settle_many
+from dro_grasp.simulation.trial import hand_shift, settle, settle_many
 from dro_grasp.simulation.weighing import WeighingConfig, weigh, weigh_many
 from dro_grasp.simulation.worlds import WARP
 from tests.helpers.loaded_hands import loaded_hand
@@ -145,6 +147,16 @@ def test_settling_of_several_objects_is_that_of_each_alone(batches: list[GraspBa
     assert any(bool(own.stable.any()) for own in together)
 
 
+def test_without_the_removal_of_slip_the_same_grasps_give_way_on_short_pulls(batches: list[GraspBatch]) -> None:
+    rules, quick = (physics(SettleConfig(), device) for device in ("cpu", "cuda"))
+    assert rules is protocol("carry")
+    assert (rules.noslip, quick.noslip) == (2, 0)
+    slow, fast = (grasp_state_many(HAND, OBJECTS, batches, own)[0] for own in (rules, quick))
+    assert torch.equal(gives_way(slow), gives_way(fast))
+    assert 0 < int(gives_way(slow).sum()) < 9
+    assert not torch.equal(slow.gave, fast.gave)
+
+
 def test_parts_of_a_batch_have_the_objects_of_their_grasps(
     batches: list[GraspBatch], steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,11 +194,17 @@ def test_warp_steps_several_objects_as_mujoco_does_each(batches: list[GraspBatch
     """On the processor, where kernels compile for minutes the first time."""
     pytest.importorskip("mujoco_warp")
     found = settle_many(HAND, OBJECTS, batches, "strict", device=WARP)
+    held = 0
     for obj, grasps, own in zip(OBJECTS, batches, found, strict=True):
         expected = settle(HAND, obj, grasps, "strict")
-        near(own.T_object_wrist[:, :3, 3], expected.T_object_wrist[:, :3, 3], 2e-3)
-        near(own.joints, expected.joints, 0.03)
-        assert float((own.T_object_wrist - grasps.T_object_wrist).abs().max()) > 1e-3
+        moved = hand_shift(HAND, grasps, expected)
+        apart, still = hand_shift(HAND, own, expected), moved < LOST_DISTANCE
+        # What is thrown away lands elsewhere for a difference in the last digit, but not each time.
+        assert float(apart.min()) < 2e-3 < float(moved.max())
+        near(apart[still], torch.zeros_like(apart[still]), 1e-4)
+        near(own.joints[still], expected.joints[still], 2e-3)
+        held += int(still.sum())
+    assert held >= 3
 
 
 def test_a_shape_that_is_absent_takes_no_part_in_the_stand_in() -> None:

@@ -30,6 +30,7 @@ from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import settle, simulate
 from dro_grasp.simulation.warp_worlds import Room
+from dro_grasp.simulation.weighing import weigh
 from dro_grasp.simulation.worlds import STATE, WARP
 from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.worker import EngineConfig
@@ -123,6 +124,20 @@ def test_worlds_without_room_run_on_the_processor_and_the_others_stay_what_they_
 
     steps(nonsense)
     same(simulate(hand, obj, grasps, CARRY, device="cuda", confirm=False), simulate(hand, obj, grasps, CARRY))
+
+
+@pytest.mark.parametrize("rules", [CARRY, protocol("dexgraspbench"), protocol("strict")], ids=lambda rules: rules.name)
+def test_fewer_grasps_than_threads_are_pulled_in_all_directions_at_once_with_the_same_outcome(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, rules: Protocol
+) -> None:
+    same(simulate(hand, obj, grasps, rules, workers=9), simulate(hand, obj, grasps, rules, workers=1))
+    known = grasps.replace(payload=torch.full((len(grasps),), 0.4))
+    found = [weigh(hand, obj, known, rules, workers=workers) for workers in (9, 1)]
+    assert torch.equal(*found)
+    assert float(found[0].max()) > 0
+    assert Rollout(cached_scene(hand, obj, rules), grasps, 9).spreads
+    assert not Rollout(cached_scene(hand, obj, rules), grasps, len(grasps)).spreads
+    assert not Rollout(cached_scene(hand, obj, rules), grasps, 9, stride=10).spreads
 
 
 def test_rows_that_do_not_step_stay_as_they_are_and_what_exploded_steps_no_more(

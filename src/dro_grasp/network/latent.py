@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp.devices import repeat
 from dro_grasp.network.encoder import SLOPE, EdgeLayer, Graph, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0  # Log-variances of z are clamped to plus and minus this. Source: ours
@@ -102,11 +103,18 @@ class FlowPrior(nn.Module):
 
     def forward(self, noise: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]) -> Float[Tensor, "b latent"]:
         """Turn standard normal noise into z, by the midpoint rule."""
-        z, step = noise, 1 / self.STEPS
-        for i in range(self.STEPS):
-            time = torch.full_like(noise[:, :1], i * step)
-            middle = z + 0.5 * step * self.velocity(z, time, condition)
-            z = z + step * self.velocity(middle, time + 0.5 * step, condition)
+        length = 1 / self.STEPS
+
+        def step(z: Float[Tensor, "b latent"], number: Int[Tensor, "1"]) -> Float[Tensor, "b latent"]:
+            time = (number.to(z.dtype) / self.STEPS).expand(len(z), 1)
+            middle = z + 0.5 * length * self.velocity(z, time, condition)
+            return z + length * self.velocity(middle, time + 0.5 * length, condition)
+
+        if not condition.requires_grad:
+            return repeat(step, noise, self.STEPS)
+        z = noise
+        for number in torch.arange(self.STEPS, device=z.device):  # a graph that is captured has no gradients
+            z = step(z, number)
         return z
 
 

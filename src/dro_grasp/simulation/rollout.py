@@ -84,7 +84,7 @@ class Rollout:
         start, target = grasps.joints, grasps.joints
         if rules.closing:
             start, target = grasps.pregrasp_joints, grasps.squeeze_joints
-        self.scene, self.stride = scene, stride
+        self.scene, self.stride, self.workers = scene, stride, workers
         self.size = len(grasps)
         self.shares = shares or (Share(scene, self.size),)
         self.mass = self._of_object(lambda scene, rows: np.full(rows.stop - rows.start, object_mass(scene.obj, rules)))
@@ -227,9 +227,9 @@ class Rollout:
     def spreads(self) -> bool:
         """Whether all directions of a pull are tried at once: a device takes as long for many trials as for few.
 
-        The processor takes one after the other, and leaves out those after the first that fails.
+        On the processor they follow each other, and what fails is pulled no more, unless there are fewer trials than threads.
         """
-        return not on_processor(self.device) and self.stride is None
+        return self.stride is None and (not on_processor(self.device) or self.size < self.workers)
 
     def _pushed(self, rows: Int[np.ndarray, " k"], pulls: Pulls, begin: Moment) -> ObjectState:
         """What each force does to some of the trials, from one moment on; it has as many rows for each as there are trials."""

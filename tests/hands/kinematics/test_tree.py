@@ -13,6 +13,7 @@ import torch
 from dro_grasp.hands.description.loader import Description, load_description
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import ASSET_FILES, BUILTIN_FOLDER
+from tests.helpers.operators import Operators
 from tests.helpers.toy_hand import toy_tree
 
 BUILTIN = [str(file) for file in sorted(BUILTIN_FOLDER.glob("*.urdf"))]
@@ -141,6 +142,25 @@ def test_any_batch_axes(batch):
     assert poses.shape == (*batch, tree.n_links, 4, 4)
     one = tree.forward(q.reshape(-1, tree.n_dof)[0])
     torch.testing.assert_close(poses.reshape(-1, tree.n_links, 4, 4)[0], one)
+
+
+@pytest.mark.parametrize("file", [None, *BUILTIN], ids=lambda f: Path(f or "awkward").stem)
+def test_the_way_of_a_device_gives_the_same_poses_and_gradients_in_fewer_operators(file, awkward):
+    tree = (described(file) if file else awkward).tree.double
+    q = tree.lower + torch.rand(2, 3, tree.n_dof, dtype=torch.float64) * (tree.upper - tree.lower)
+    q.requires_grad_()
+    few, usual = tree._forward_in_few_operators(q), tree.forward(q)
+    assert few.is_contiguous()
+    torch.testing.assert_close(few, usual, rtol=0, atol=1e-12)
+    weight = torch.randn_like(usual)
+    a, b = (torch.autograd.grad((T * weight).sum(), q)[0] for T in (few, usual))
+    torch.testing.assert_close(a, b, rtol=0, atol=1e-11)
+    counts = []
+    for forward in (tree._forward_in_few_operators, tree.forward):
+        with Operators("cpu") as seen:
+            forward(q.detach())
+        counts.append(seen.count)
+    assert file is None or counts[0] <= 0.7 * counts[1], counts
 
 
 def test_descends_follows_the_parents():

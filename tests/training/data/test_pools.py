@@ -16,7 +16,7 @@ import pytest
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimize.synthesis import SynthesisConfig
-from dro_grasp.training.data.engine.pools import LocalPool
+from dro_grasp.training.data.engine.pools import LocalPool, shards_at_once
 from dro_grasp.training.data.engine.schedule import simulating_threads, synthesize_dataset
 from dro_grasp.training.data.engine.shards import Shard, find_shards, read_yield, sole_run
 from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
@@ -88,6 +88,14 @@ def test_workers_that_feed_a_device_simulate_on_their_share_of_the_cores(monkeyp
     finally:
         work.close()
     assert failed.reason == "5 1"
+
+
+@pytest.mark.parametrize(("resources", "on_device", "expected"), [
+    ({"CPU": 32.0}, False, (32, 1)), ({"CPU": 32.0, "GPU": 1.0}, False, (32, 1)), ({}, False, (1, 1)), ({}, True, (1, 1)),
+    ({"CPU": 16.0, "GPU": 1.0}, True, (4, 4)), ({"CPU": 34.0, "GPU": 2.0}, True, (8, 4)),
+    ({"CPU": 2.0, "GPU": 8.0}, True, (2, 1)), ({"CPU": 8.0}, True, (1, 8))])
+def test_a_cluster_s_gpus_are_shared_and_their_shards_share_its_cpus(resources, on_device, expected):
+    assert shards_at_once(resources, on_device) == expected
 
 
 def test_an_idle_worker_that_dies_is_replaced():

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import cached_tensor
+from dro_grasp.devices import cached_tensor, on_accelerator
 from dro_grasp.geometry.se3 import apply, rotate
 
 FIXED = 0  # Kind of a link that does not move against its parent (ours)
@@ -185,6 +185,8 @@ class KinematicTree:
 
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Pose of every link in the root link's frame, T_root_link, at values of the independent joints [rad or m]."""
+        if on_accelerator(q.device):
+            return self._forward_in_few_operators(q)
         x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
         basis = self._local_basis
         local = basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]
@@ -193,6 +195,35 @@ class KinematicTree:
         for links, parents in self._levels:
             levels.append(levels[-1].index_select(-3, parents) @ local.index_select(-3, links))
         return torch.cat(levels, -3).index_select(-3, self._level_order)
+
+    def _forward_in_few_operators(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
+        """The same by more products in fewer operators, which a device takes as long for as for few products."""
+        coupling, offset, constant, sine, cosine, straight = self._padded
+        x = torch.nn.functional.linear(q, coupling, offset)[..., None, None]
+        T = torch.addcmul(torch.addcmul(torch.addcmul(constant, x.sin(), sine), x.cos(), cosine), x, straight)
+        # Each round doubles the length of the way towards the root that a product covers.
+        for ancestors in self._ancestors:
+            T = T.index_select(-3, ancestors) @ T
+        return T.narrow(-3, 0, self.n_links).contiguous()
+
+    @cached_tensor
+    def _padded(self) -> tuple[Float[Tensor, "..."], ...]:
+        """Coupling, offset and constant matrices of `forward`, with an identity after the last link."""
+        none = torch.zeros_like(self.origin[:1])
+        at_rest, sine, cosine, straight = self._local_basis
+        constant = torch.cat([at_rest + cosine, torch.eye(4).to(none)[None]])
+        rows = torch.cat([self.link_coupling, torch.zeros_like(self.link_coupling[:1])])
+        offset = torch.cat([self.link_offset, torch.zeros_like(self.link_offset[:1])])
+        return rows, offset, constant, *(torch.cat([part, none]) for part in (sine, -cosine, straight))
+
+    @cached_tensor
+    def _ancestors(self) -> tuple[Int[Tensor, " n"], ...]:
+        """Per round of `_forward_in_few_operators`, how far up the next piece of the way of each link begins."""
+        rounds, now = [], [parent if parent >= 0 else self.n_links for parent in self.parent] + [self.n_links]
+        while any(place != self.n_links for place in now):
+            rounds.append(torch.tensor(now, device=self.origin.device))
+            now = [now[place] for place in now]
+        return tuple(rounds)
 
     def motion_axes(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"]

@@ -11,7 +11,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -163,7 +163,7 @@ RETRIES = 3
 
 
 class RayPool:
-    """Tasks of a Ray cluster, one CPU each.
+    """Tasks of a Ray cluster, which are as many as `shards_at_once` says.
 
     A process of its own joins the cluster: Ray ends the process that joined, without a word, when the node of its machine
     dies. A cluster that this process has joined already is used from here.
@@ -190,7 +190,7 @@ class RayPool:
 
     @property
     def free(self) -> int:
-        """CPUs of the cluster now, less the shards in flight; at least one shard may wait for a node."""
+        """Shards that the cluster makes at once now, less those in flight; at least one may wait for a node."""
         return self._ask(_free)
 
     def submit(self, task: Task) -> None:
@@ -244,9 +244,12 @@ class RayTasks:
         if self.joined_here:
             _connect(address, workers)
         self.job = ray.put(job)
-        options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
-        if job.config.synthesis.device != "cpu":
+        options: dict[str, Any] = {"max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        self.on_device = job.config.synthesis.device != "cpu"
+        if self.on_device:
             options["num_gpus"] = GPU_SHARE
+        # Ray lets a task simulate in as many threads.
+        _, options["num_cpus"] = shards_at_once(ray.cluster_resources(), self.on_device)
         # Errors come back as values, so Ray retries lost machines and nothing else.
         self.start = ray.remote(**options)(attempt)
         self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
@@ -294,7 +297,19 @@ def _join(*arguments: Any) -> None:
 
 def _free() -> int:
     tasks = RayTasks.here()
-    return max(0, max(1, int(tasks.ray.cluster_resources().get("CPU", 0))) - len(tasks.running))
+    return max(0, shards_at_once(tasks.ray.cluster_resources(), tasks.on_device)[0] - len(tasks.running))
+
+
+def shards_at_once(resources: Mapping[str, float], on_device: bool) -> tuple[int, int]:
+    """How many shards a cluster of these resources makes at once, and the CPUs of each.
+
+    One for each CPU; where GPUs make the candidates, as many as share the GPUs, each with its share of the CPUs.
+    """
+    cpus = max(1, int(resources.get("CPU", 0)))
+    if not on_device:
+        return cpus, 1
+    count = min(cpus, max(1, int(resources.get("GPU", 0) / GPU_SHARE)))
+    return count, cpus // count
 
 
 def _submit(task: Task) -> None:
