@@ -184,7 +184,7 @@ class Rollout:
                 if moment is not None:
                     self.batch.bind(name)[row] = moment[name]
         if begun:
-            self._remember({begun[row]: row for row in rows})
+            self._remember({begun[row]: row for row in rows.tolist()})
         if self.scene.table:
             self.batch.bind("mocap_pos")[:] = TABLE_AWAY
             self.batch.bind("mocap_quat")[:] = [1.0, 0.0, 0.0, 0.0]  # as it is turned now, it may lie over the hand
