@@ -157,3 +157,24 @@ def test_no_more_is_waited_for_than_the_cpu_s_own(device: str) -> None:
     assert where_any(mask.to(device)) == slice(None)
     assert not may_hold(torch.zeros(2, dtype=torch.bool))
     assert may_hold(torch.zeros(2, dtype=torch.bool).to(device))
+
+
+def test_what_repeated_steps_make_and_cache_can_be_differentiated() -> None:
+    kept: list[Tensor] = []
+
+    def step(x: Tensor, number: Tensor) -> Tensor:
+        if not kept:
+            kept.append(torch.full((2,), 3.0))
+        return x * kept[0]
+
+    with torch.no_grad():
+        end = repeat(step, torch.ones(2), 3)
+    assert end.tolist() == [27.0, 27.0]
+    factor = torch.ones(2, requires_grad=True)
+    (factor * end * kept[0]).sum().backward()
+    assert factor.grad is not None
+    assert factor.grad.tolist() == [81.0, 81.0]
+    end += 1  # nor is it forbidden to write to it
+    followed = torch.ones(2, requires_grad=True)
+    (gradient,) = torch.autograd.grad(repeat(step, followed, 3).sum(), followed)
+    assert gradient.tolist() == [27.0, 27.0], "where gradients are asked for, they are there"

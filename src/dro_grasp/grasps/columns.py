@@ -54,9 +54,9 @@ Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the 
 
 def require_fit(batch: Any, n_names: int) -> None:
     """Refuse columns of a batch that do not fit together: ValueError."""
-    every = {name: getattr(batch, name) for name in COLUMNS} | batch.extra
-    if wrong := {name: len(column) for name, column in every.items() if len(column) != len(batch)}:
-        raise ValueError(f"a batch of {len(batch)} grasps has columns of other lengths: {wrong}")
+    every, n = {name: getattr(batch, name) for name in COLUMNS} | batch.extra, len(batch)
+    if wrong := {name: length for name, column in every.items() if (length := len(column)) != n}:
+        raise ValueError(f"a batch of {n} grasps has columns of other lengths: {wrong}")
     if batch.joints.shape[1] != n_names:
         raise ValueError(f"{batch.joints.shape[1]} values for {n_names} joint names")
     if taken_names := sorted(batch.extra.keys() & {*COLUMNS, "success"}):

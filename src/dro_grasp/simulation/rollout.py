@@ -32,6 +32,8 @@ CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does no
 DEVICE_CHUNK = 4096  # The same on a device. Ours: a step takes 1.6 ms for 1,024 worlds and 2.0 for 2,048 on an H100
 FEW = 64  # Fewer grasps run on the processor, which is done before a device has begun (ours)
 GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
+CLOSINGS = 1024
+"""Closings that a scene keeps (ours), each of some hundred bytes: grasps repeat theirs as they are weighed and tried."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Rollout:
         if conditions is not None:
             grasps = GraspBatch.concatenate([
                 conditions.rows(rows).displaced(grasps[rows], own.obj.centre_of_mass) for own, rows in self.parts()])
-        self.device = device
+        self.device, self.altered = device, conditions is not None
         self.batch = worlds(self.shares, workers, device)
         if conditions is not None:
             self._change(conditions)
@@ -122,19 +124,45 @@ class Rollout:
         return torch.device("cpu" if self.device == WARP or on_processor(self.device) else self.device)
 
     def close(self) -> ObjectState:
-        """Move to the target for the protocol's closing time; a table is there until then, and gone afterwards."""
-        everyone, steps = np.arange(self.size), self._steps(self.scene.protocol.closing_time)
+        """Move to the target for the protocol's closing time; a table is there until then, and gone afterwards.
+
+        What has closed in the same way before, in this scene, is not simulated again.
+        """
+        begun, steps = self._beginnings(), self._steps(self.scene.protocol.closing_time)
+        before = [self.scene.closings.get(key) for key in begun] if begun else [None] * self.size
+        rows = np.flatnonzero([moment is None for moment in before])
         if len(self.targets) == 1:
-            self._advance(everyone, steps)
+            self._advance(rows, steps)
         for begin, end in pairwise(self.targets):
             for i in range(RAMP):
                 self.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
-                self._advance(everyone, steps // (RAMP * (len(self.targets) - 1)))
+                self._advance(rows, steps // (RAMP * (len(self.targets) - 1)))
+        for name in STATE:
+            for row, moment in enumerate(before):
+                if moment is not None:
+                    self.batch.bind(name)[row] = moment[name]
+        if begun:
+            self._remember({begun[row]: row for row in rows.tolist()})
         if self.scene.table:
             self.batch.bind("mocap_pos")[:] = TABLE_AWAY
             self.batch.bind("mocap_quat")[:] = [1.0, 0.0, 0.0, 0.0]  # as it is turned now, it may lie over the hand
             self.force[:] = 0.0
         return self.observe()
+
+    def _beginnings(self) -> list[bytes]:
+        """What decides where each hand ends as it closes; nothing where more than that decides, or frames are recorded."""
+        if self.altered or self.scene.table or self.stride is not None or not on_processor(self.device):
+            return []
+        columns = [*(np.array(self.batch.bind(name)) for name in STATE), *self.targets]
+        return [b"".join(column[row].tobytes() for column in columns) for row in range(self.size)]
+
+    def _remember(self, rows: dict[bytes, int]) -> None:
+        """Keep where hands have ended, of sound simulations."""
+        closings, unsound = self.scene.closings, self.batch.unsound
+        if len(closings) + len(rows) > CLOSINGS:
+            closings.clear()
+        closings.update({key: {name: np.array(self.batch.bind(name)[row]) for name in STATE}
+                         for key, row in rows.items() if not unsound[row]})
 
     def press(self, targets: Float[np.ndarray, "n n_servos"], seconds: float) -> ObjectState:
         """Move on to other targets for a time [s]."""
@@ -184,7 +212,7 @@ class Rollout:
 
     def make_heavy(self, mass: Float[np.ndarray, " n"]) -> None:
         """Give each object another mass [kg], and inertia in proportion; go back to a moment afterwards."""
-        factor = mass / self.mass
+        factor, self.altered = mass / self.mass, True
         self.batch.expand("body_mass")[:, self.scene.object_body] *= factor
         self.batch.expand("body_inertia")[:, self.scene.object_body] *= factor[:, None]
         self.batch.set_const()

@@ -153,6 +153,8 @@ class TrialScene:
     protocol: Protocol
     table: bool = False
     """Whether there is a table, the body `table`, which is TABLE_AWAY until a grasp is written."""
+    closings: dict[bytes, dict[str, Float[np.ndarray, " k"]]] = field(default_factory=dict, repr=False)
+    """Where hands that closed in this scene ended, by how they began; see `Rollout.close`."""
 
     @cached_property
     def object_body(self) -> int:
