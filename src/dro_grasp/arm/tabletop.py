@@ -24,7 +24,9 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan
+from dro_grasp.arm.flat_plans import plan_or_slide
+from dro_grasp.arm.flat_things import seen_flat
+from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
 from dro_grasp.arm.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
 from dro_grasp.arm.placing import AWAY, foot, off_table
 from dro_grasp.arm.planner import PlanConfig, plan
@@ -57,6 +59,7 @@ PLACED_UPRIGHT = 15.0  # Largest tilt of it [degrees], likewise
 FELL = 45.0  # Tilt from which on it is said to have fallen over [degrees] (ours)
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 REFLECTANCES = (0.1, 0.9)  # Shares of the light that things return, the table among them [1] (ours)
+PUSHES = 4  # Most pushes of a flat thing towards an edge (ours)
 STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
 
 Region = tuple[float, float, float, float]  # Least x and y, greatest x and y, from the arm's base [m]
@@ -84,6 +87,9 @@ class TabletopConfig(Checked):
     """How motions are planned."""
     mass: float | None = None
     """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
+    slide: bool = True
+    """Whether what lies flat is pushed to an edge of the table where no grasp of it is trusted. Its pixels have to be known:
+    `segment` "mask", or `see` "mesh"."""
     place: bool = False
     """Whether the object is put down at a random free place of the region, instead of held and shaken."""
 
@@ -112,7 +118,8 @@ class TabletopConfig(Checked):
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
         # What is not asked for is left out: attempts of before it could be are not repeated.
-        given = {name: value for name, value in asdict(self).items() if (name, value) not in (("mass", None), ("place", False))}
+        usual = (("mass", None), ("place", False), ("slide", True))
+        given = {name: value for name, value in asdict(self).items() if (name, value) not in usual}
         return LABEL + json.dumps(given, sort_keys=True)
 
     @staticmethod
@@ -180,6 +187,8 @@ class Attempt:
     """Angle between the placed object's upright and the one it had [degrees], likewise."""
     place_turn: float | None = None
     """How far it is turned about the vertical from what was planned [degrees], likewise."""
+    pushes: int = 0
+    """How often it was pushed towards an edge of the table before it was grasped."""
     pushed: float = 0.0
     """Largest displacement of another object [m]."""
     robot_file: str = ""
@@ -232,14 +241,25 @@ def attempt(
         return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
     start, *beside = (scene.pose(i) for i in range(len(scene.objects)))
     result = replace(result, place=json.dumps(start.round(6).tolist()))
-    begin, processor = time.perf_counter(), time.process_time()
     try:
-        seen, T = _see(scene, config, int(draw.integers(2**31)))
-        see_seconds = time.perf_counter() - begin
-        result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-        grasps = None if proposer is None else proposer(seen, T, seed + number)
-        place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
-        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
+        while True:
+            begin, processor = time.perf_counter(), time.process_time()
+            seen, T = _see(scene, config, int(draw.integers(2**31)))
+            see_seconds = time.perf_counter() - begin
+            result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
+            grasps = None if proposer is None else proposer(seen, T, seed + number)
+            place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
+            if grasps is None and config.slide:
+                made = plan_or_slide(
+                    seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, place=place)
+            else:
+                made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
+            if made.notes.slide is None:
+                break
+            if watch is not None:
+                watch.planned(seen, made)
+            if (result := _pushed(result, scene, made, watch)).reason:
+                return result
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -256,6 +276,18 @@ def attempt(
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
     pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
+
+
+def _pushed(result: Attempt, scene: LiftScene, made: MotionPlan, watch: Watcher | None) -> Attempt:
+    """An attempt after a push to the table's edge."""
+    for stage in SLIDING:
+        _follow(scene, made, stage, None if watch is None else lambda: watch.moved(scene))
+    table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
+    if scene.pose(0)[2, 3] < table.height - 0.02:  # [m] (ours)
+        return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
+    if result.pushes > PUSHES:
+        return replace(result, stage="slide", reason=f"the object does not overhang the table's edge after {PUSHES} pushes")
+    return result
 
 
 def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:
@@ -449,7 +481,10 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
     points = depth_points(depth, thinned_intrinsics(camera))
     known = mask[depth > 0] if config.segment == "mask" else None
-    seen = pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
+    eye, flat = camera.T_world_camera, None
+    if known is not None and config.slide:
+        flat = seen_flat(obj.name, points @ eye[:3, :3].T + eye[:3, 3], known, robot, eye[:3, 3])
+    seen = flat or pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
     return seen if config.mass is None else replace(seen, obj=with_mass(seen.obj, config.mass)), np.eye(4)
 
 
