@@ -29,7 +29,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
 REHEARSED = 24  # Grasps at an edge whose lift is simulated (ours): one takes a tenth of a second
-UNLIKELY = 0.015
+UNLIKELY = 0.02
 """Height up to which grasps from above are not looked for before a push [m] (ours): round fingertips slip off such edges."""
 
 

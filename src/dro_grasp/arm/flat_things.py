@@ -7,15 +7,14 @@ Ours.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, KDTree
 
-from dro_grasp.arm.robot import Robot, Table
-from dro_grasp.arm.table_scene import PickedObject
+from dro_grasp.arm.robot import Table
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object, mesh_object
@@ -51,35 +50,38 @@ def overhang(points: Float[np.ndarray, "n 3"], table: Table) -> Float[np.ndarray
     return (np.abs(points[:, :2] - table.centre) - np.array(table.size) / 2).max(1)
 
 
+@dataclass(frozen=True, eq=False)
+class SeenFlat:
+    """A flat thing on a table, as it was seen."""
+
+    obj: ObjectModel  # In the world
+    others: list[ObjectModel]  # Other things on the table, as one cloud in the world, if there are any
+    table: float  # Height of the table [m]
+
+
 def seen_flat(
-    name: str, points: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], robot: Robot, eye: Float[np.ndarray, "3"]
-) -> PickedObject | None:
-    """A thing of which the pixels are known, if it lies flat; None for other things.
+    name: str, points: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], table: Table, eye: Float[np.ndarray, "3"]
+) -> SeenFlat | None:
+    """A thing of which the pixels are known, if it lies flat; None for other things, and where no table is seen.
 
     Args:
         name: What to call it.
         points: All that was seen, in the world [m]: the table, too.
         mask: Which points are of the thing; where it overhangs its table, too.
-        robot: With a table.
+        table: Where the table is, but for its exact height.
         eye: Where the camera is [m].
-
-    Raises:
-        ObjectError: There is no level table.
     """
-    table = robot.table
-    assert table is not None
     inside = overhang(points, table) < 0
     plane = largest_plane(points[inside & ~mask], SAME, 0.2, fits=3)
     if plane is None:
-        raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")
+        return None
     height = float((plane[3] - plane[:2] @ np.array(table.centre)) / plane[2])
     if mask.sum() < FEWEST or not lies_flat(points[mask], height):
         return None
     standing = points[inside & ~mask & (points[:, 2] > height + ABOVE) & (points[:, 2] < height + HIGHEST)]
     apart = standing[KDTree(points[mask]).query(standing)[0] > ASIDE] if len(standing) else standing
     others = [cloud_object("other things", apart, origin="other things", keep_table=True)] if len(apart) >= MIN_CLOUD else []
-    level = replace(robot, table=replace(table, height=height))
-    return PickedObject(flat_object(name, points[mask], eye, height), others, level)
+    return SeenFlat(flat_object(name, points[mask], eye, height), others, height)
 
 
 def flat_object(

@@ -195,7 +195,7 @@ def _working(hand: Hand, config: PostureConfig) -> WorkingHand:
     fingers = tuple(i for i in range(len(hand.fingers)) if i != hand.thumb)
     if hand.thumb is None or len(fingers) < 2:
         raise OptionError(f"hand '{hand.name}' has no thumb and two fingers beside it, between which flat things fit; grasp "
-                          "them without a slide (slide=False)")
+                          "them as other things, by dro_grasp.plan")
 
     def ahead_of(points: Float[Tensor, "n k 3"], is_tip: Bool[Tensor, " k"]) -> Float[Tensor, " n"]:
         return points[..., AHEAD].amax(1)

@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from dro_grasp.arm.flat_things import overhang, seen_flat
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import VOXEL
 from dro_grasp.errors import ObjectError, RobotError
@@ -24,6 +25,7 @@ from dro_grasp.objects.shape import ObjectModel
 THICKNESS = 0.006  # Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)
 NEIGHBOUR = 0.012
 """Points nearer to each other than this are of one object [m] (ours): a camera a metre away has points each 3 mm."""
+OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
 FEWEST = 60  # Fewest points of an object (ours)
 
 
@@ -57,7 +59,8 @@ def pick_object(
 ) -> PickedObject:
     """Find the table in a cloud, remove it, and pick one of the objects on it.
 
-    Objects are told apart by distance: two that are less than 12 mm apart count as one, unless a mask is given.
+    Objects are told apart by distance: two that are less than 12 mm apart count as one, unless a mask is given. A mask also
+    shows what is too flat for the camera's depth, such as a card.
 
     Examples:
         >>> picked = pick_object("mug", points, robot, robot.camera.T_world_camera, near=(0.5, 0.1))
@@ -84,6 +87,10 @@ def pick_object(
     if wanted is not None and wanted.shape != (len(given),):
         raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")
     finite = returned(given)
+    if wanted is not None and T is not None:
+        world = given[finite] @ T[:3, :3].T + T[:3, 3]
+        if (flat := seen_flat(name, world, wanted[finite], robot.table, T[:3, 3])) is not None:
+            return PickedObject(flat.obj, flat.others, replace(robot, table=replace(robot.table, height=flat.table)))
     sight = sort_out(
         given[finite], np.eye(4) if T is None else T, robot.table, near, None if wanted is None else wanted[finite])
     if len(sight.places) > 1 and near is None and mask is None:
@@ -134,10 +141,10 @@ def sort_out(
         ObjectError: There is no level plane, nothing stands on it, or the mask has nothing of it.
     """
     world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    inside = (np.abs(world[:, :2] - table.centre) < np.array(table.size) / 2).all(1)
-    plane = fit_plane(world[inside])
+    beyond = overhang(world, table)
+    plane = fit_plane(world[beyond < 0])
     height = world @ plane[:3] - plane[3]
-    kept = inside & (height > THICKNESS) & (height < 0.4)  # [m]: what is higher is no object's (ours)
+    kept = (beyond < OVERHANG) & (height > THICKNESS) & (height < 0.4)  # [m]: what is higher is no object's (ours)
     middle = (plane[3] - plane[:2] @ np.array(table.centre)) / plane[2]
     points, world, group = points[kept], world[kept], clusters(world[kept])
     sizes = np.bincount(group) if len(group) else np.zeros(1, int)

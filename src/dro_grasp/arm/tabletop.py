@@ -25,7 +25,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from dro_grasp.arm.flat_plans import plan_or_slide
-from dro_grasp.arm.flat_things import seen_flat
 from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
 from dro_grasp.arm.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
 from dro_grasp.arm.placing import AWAY, foot, off_table
@@ -88,8 +87,7 @@ class TabletopConfig(Checked):
     mass: float | None = None
     """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
     slide: bool = True
-    """Whether what lies flat is pushed to an edge of the table where no grasp of it is trusted. Its pixels have to be known:
-    `segment` "mask", or `see` "mesh"."""
+    """Whether what lies flat is pushed to an edge of the table where no grasp of it is trusted."""
     place: bool = False
     """Whether the object is put down at a random free place of the region, instead of held and shaken."""
 
@@ -481,10 +479,7 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
     points = depth_points(depth, thinned_intrinsics(camera))
     known = mask[depth > 0] if config.segment == "mask" else None
-    eye, flat = camera.T_world_camera, None
-    if known is not None and config.slide:
-        flat = seen_flat(obj.name, points @ eye[:3, :3].T + eye[:3, 3], known, robot, eye[:3, 3])
-    seen = flat or pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
+    seen = pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known)
     return seen if config.mass is None else replace(seen, obj=with_mass(seen.obj, config.mass)), np.eye(4)
 
 
