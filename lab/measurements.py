@@ -30,6 +30,13 @@ MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
 """Built-in arms with hands."""
+ROBOT_HANDS = ("leaphand", "allegro")
+"""Their hands."""
+TEST_OBJECTS = ("camera", "chess_pawn", "lemon", "mug", "rubber_duck", "screwdriver", "soap", "spray_bottle", "teapot",
+                "wine_glass")
+"""Those of `builtin:test`, one a command."""
+TABLES = 6
+"""Tables that each robot clears."""
 SEEN_IN_PART = "seen in part"  # End of the names of cells of one depth image
 FAST, ALL = "carry dexgraspbench strict", "carry robust dexgraspbench strict"
 """Protocols: those of one trial a grasp, and with the one of eight. Beside the paper stands its own as well: `dro`."""
@@ -101,6 +108,16 @@ def _confidence() -> dict[str, str]:
         "--view depth --num 8 --json" for hand in PAPER_HANDS}
 
 
+def _lifts(robot: str, row: str, objects: str, attempts: int, options: str = "") -> str:
+    # Without --output: what a folder keeps may be of other code.
+    return (f"python -m lab.benchmarks.lifts --robots {robot} --rows {row} --objects {objects} --attempts {attempts} "
+            f"{options}--json")
+
+
+def _attempts(row: str, attempts: int) -> dict[str, str]:
+    return {f"{robot}, {name}": _lifts(robot, row, name, attempts) for robot in ROBOTS for name in TEST_OBJECTS}
+
+
 MEASUREMENTS = {
     "headline": Measurement(
         "The paper's hands on objects that no weights were trained on, with controls of equal time", _headline()),
@@ -131,9 +148,21 @@ MEASUREMENTS = {
             "auto", hand, OBJECTS["validate"], f"--view {view} --num 16 --stages returned --protocols {FAST}")
         for view in ("cloud", "half", "depth") for hand in PAPER_HANDS}),
     "lifts": Measurement("Arms that see an object in one depth image, plan, grasp, lift, hold and shake it", {
-        f"{robot}, {row}": f"python -m lab.benchmarks.lifts --robots {robot} --rows {row} --attempts {attempts} "
-        f"--output {PREPARED}/lifts --json"
-        for robot in ROBOTS for row, attempts in (("cloud", 2), ("random", 1))}, wings=("arm", "compare")),
+        **_attempts("cloud", 10), **{f"{robot}, any grasp": _lifts(robot, "random", OBJECTS["test"], 1) for robot in ROBOTS},
+    }, wings=("arm", "compare")),
+    "asked": Measurement("The same, of the thing that is asked for among three others", _attempts("asked", 3),
+                         wings=("arm", "compare")),
+    "placed": Measurement("Objects that are lifted and put down at a random place", _attempts("place", 5),
+                          wings=("arm", "compare")),
+    "cleared": Measurement("Tables with six things that are cleared into a bin", {
+        f"{robot}, table {seed}": f"dro-grasp clear --robot {robot} --objects {OBJECTS['test']} --things 6 --seed {seed} --json"
+        for robot in ROBOTS for seed in range(TABLES)}, wings=("arm", "compare")),
+    "holding": Measurement("Whether a hand holds, is empty or slips, by its joints alone", {
+        hand: f"python -m lab.benchmarks.hold_check --generated --hands {hand} --group {OBJECTS['test']} --objects 10 "
+        "--grasps 6 --most 34 --json" for hand in ROBOT_HANDS}),
+    "planning": Measurement("Times from the image of a scene to a plan, nothing beside", {
+        robot: _lifts(robot, "asked", OBJECTS["test"], 1, "--seed 1 ") for robot in ROBOTS
+    }, wings=("arm", "compare"), alone=True),
     "constraints": Measurement("What constraints cost, and whether what is returned respects them", {
         name: "python -m lab.benchmarks.constraints --cases " + shlex.quote(name) + " --json"
         for name in ("nothing", "direction", "max_tilt", "obstacles", "contact_region", "keep_out", "pregrasp_clearance")}),

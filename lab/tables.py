@@ -8,6 +8,7 @@ A table is of one state: its rows come from the same code and the same weights. 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -15,15 +16,17 @@ import json
 import math
 import statistics
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from dro_grasp.arm.motion import PLACING
 from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import ALL, Row, average
 from lab import pages
 from lab.benchmarks.report import ROOT
-from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART
+from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART, TEST_OBJECTS
 from lab.runner import RESULTS
 from lab.studies import payload
 
@@ -42,6 +45,13 @@ METHODS = {"auto": "dro-grasp", "optimiser": "optimiser alone", "mean-grasp": "m
 """Methods of equal time, and what they are called."""
 CONTROLS = {name: f"{text}, equal time" for name, text in METHODS.items() if name != "auto"}
 """Those that no network takes part in."""
+TASKS = {"lifts": "lifted, held and shaken", "asked": "the same, of the one asked for among three others",
+         "placed": "placed within 2 cm and 15 degrees, of those lifted"}
+"""Measurements of attempts, and what they are called."""
+LIFTED = {*PLACING, "place", "done"}
+"""Where attempts with a place end whose object was in the air."""
+HELD_BY = "twice, efforts"
+"""What is measured of hands that may hold, in `lab.benchmarks.hold_check`."""
 Cell = dict[str, Any]
 
 
@@ -71,6 +81,15 @@ class Results:
     def cells(self, measurement: str, ending: str = "") -> dict[str, Any]:
         """What all commands of a measurement printed whose names end so."""
         return {name: self.cell(measurement, name) for name in MEASUREMENTS[measurement].cells if name.endswith(ending)}
+
+    def some(self, measurement: str, start: str = "") -> list[Any]:
+        """What those commands printed whose names start so, of those that were run."""
+        found = list[Any]()
+        for name in MEASUREMENTS[measurement].cells:
+            if name.startswith(start):
+                with contextlib.suppress(MissingResult):
+                    found.append(self.cell(measurement, name))
+        return found
 
     def rows(self, measurement: str, start: str = "", ending: str = "") -> list[Row]:
         """Rows of `dro-grasp benchmark` of all commands whose names start and end so."""
@@ -219,18 +238,61 @@ def views(results: Results) -> str:
     return table(HEAD, [line(text[view], average(results.rows("views", view))) for view in text])
 
 
-def lifts(results: Results) -> str:
-    """Attempts of each robot, and of a control that takes any reachable grasp."""
+def robot_tasks(results: Results) -> str:
+    """What robots do on their tables, and how often they succeed; what was not measured says so."""
+    lines = []
+    for measurement, text in TASKS.items():
+        for robot in ROBOTS:
+            tried = attempts(results, measurement, robot)
+            counted = [a for a in tried if a["stage"] in LIFTED] if measurement == "placed" else tried
+            ended = ", ".join(f"{stage} {count}" for stage, count in Counter(a["stage"] for a in tried).items())
+            good = sum(a["success"] for a in counted)
+            lines.append(counts(f"{text}, `{robot}`", measurement, len(tried), good, len(counted), ended))
+    for robot in ROBOTS:
+        done = results.some("cleared", robot)
+        removed, things, picks = (sum(cell[key] for cell in done) for key in ("removed", "things", "picks"))
+        also = f"{picks / removed:.2f} picks each, {sum(cell['tables'] for cell in done)} tables" if removed else ""
+        lines.append(counts(f"things cleared, six on a table, `{robot}`", "cleared", things, removed, things, also))
+    right, n = Counter[str](), Counter[str]()
+    for row in (row for cell in results.some("holding") for row in cell["rows"]):
+        if row["hand"] != "all" and row["measured"] == HELD_BY:
+            right[row["truth"]] += row[row["truth"]]
+            n[row["truth"]] += row["n"]
+    also = ", ".join(f"{truth} {right[truth]} of {n[truth]}" for truth in n)
+    lines.append(counts("held, empty or slipping, by the joints", "holding", n.total(), right.total(), n.total(), also))
+    return table(["", "asked", "counted", "reached [%]", "ended in"], lines)
+
+
+def attempts(results: Results, measurement: str, robot: str) -> list[dict[str, Any]]:
+    """Those of a robot, of all objects that were measured; controls are apart."""
+    return [a for object_name in TEST_OBJECTS for cell in results.some(measurement, f"{robot}, {object_name}")
+            for a in cell["attempts"]]
+
+
+def counts(text: str, measurement: str, asked: int, good: int, counted: int, also: str) -> list[object]:
+    """A line of a table of robots."""
+    if not asked:
+        return [text, "-", "-", f"not measured (`make results NAMES={measurement}`)", ""]
+    return [text, asked, counted, of(good, counted) if counted else "-", also]
+
+
+def planning(results: Results) -> str:
+    """How long robots plan, from the image of a scene."""
     lines = []
     for robot in ROBOTS:
-        for row, text in (("cloud", "best grasp"), ("random", "any reachable grasp")):
-            cell = results.cell("lifts", f"{robot}, {row}")
-            tried = cell["attempts"]
-            (told,) = cell["rows"]
-            planned = sum(a["processor_seconds"] > 0 for a in tried)
-            lines.append([f"`{robot}`, {text}", len(tried), planned, of(sum(a["success"] for a in tried), len(tried)),
-                          told["median [s]"], told["95 % within [s]"], told["ended in"]])
-    return table(["", "attempts", "planned", "held [%]", "median [s]", "19 of 20 within [s]", "ended in"], lines)
+        (row,) = results.cell("planning", robot)["rows"]
+        lines.append([f"`{robot}`", row["asked"], row["planned"], row["image to plan [s], median"], row["longest"],
+                      row["median [s]"]])
+    return table(["", "scenes", "planned", "median [s]", "longest [s]", "of one core, median [s]"], lines)
+
+
+def any_grasp(results: Results) -> str:
+    """The control that takes any grasp that the arm reaches."""
+    lines = []
+    for robot in ROBOTS:
+        tried = results.cell("lifts", f"{robot}, any grasp")["attempts"]
+        lines.append([f"`{robot}`", len(tried), of(sum(a["success"] for a in tried), len(tried))])
+    return table(["", "attempts", "held [%]"], lines)
 
 
 def constraints(results: Results) -> str:
@@ -414,7 +476,8 @@ def payload_error(results: Results) -> str:
 
 def lifted(results: Results, robot: str) -> str:
     """Share of attempts in which a robot held the object."""
-    tried = results.cell("lifts", f"{robot}, cloud")["attempts"]
+    if not (tried := attempts(results, "lifts", robot)):
+        raise MissingResult("lifts")
     held = success_rate(sum(a["success"] for a in tried), len(tried))
     return f"{100 * held[0]:.0f} % [{100 * held[1]:.0f}-{100 * held[2]:.0f}]"
 
@@ -476,7 +539,9 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "hard.hands": functools.partial(hands, measurement="hard"),
     "published_hard.hands": functools.partial(hands, measurement="published_hard"),
     "views.views": views,
-    "lifts.robots": lifts,
+    "robots.tasks": robot_tasks,
+    "robots.planning": planning,
+    "robots.control": any_grasp,
     "constraints.cost": constraints,
     "tables.sides": sides,
     "flat.things": flat,

@@ -16,11 +16,12 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from dro_grasp.arm.animation import OBJECT_COLOUR, Recorder
+from dro_grasp.arm.attempts import Attempt, read_attempts
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
-from dro_grasp.arm.tabletop import Attempt, TabletopConfig, carry_out, read_attempts
+from dro_grasp.arm.tabletop import TabletopConfig, carry_out
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, render
 from dro_grasp.objects.catalogue import load_object

@@ -3,6 +3,7 @@
 from ._version import __version__ as __version__
 from .apps.server.client import GraspClient as GraspClient
 from .apps.viewer.grasp_page import view_grasps as view_grasps
+from .arm.attempts import Attempt as Attempt
 from .arm.clearing import (
     Bin as Bin,
     ClearConfig as ClearConfig,
@@ -18,12 +19,8 @@ from .arm.reachability import ReachConfig as ReachConfig
 from .arm.robot import Robot as Robot, load_robot as load_robot
 from .arm.robot_check import RobotReport as RobotReport, check_robot as check_robot
 from .arm.table_scene import PickedObject as PickedObject, pick_object as pick_object
-from .arm.tabletop import (
-    Attempt as Attempt,
-    TabletopConfig as TabletopConfig,
-    TabletopRun as TabletopRun,
-    run_tabletop as run_tabletop,
-)
+from .arm.tabletop import TabletopConfig as TabletopConfig
+from .arm.tabletop_run import TabletopRun as TabletopRun, run_tabletop as run_tabletop
 from .arm.task_stages import task_stages as task_stages, task_yaml as task_yaml
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval

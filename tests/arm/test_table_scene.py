@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
+from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.table_scene import clusters, fit_plane, pick_object, sees_table, sort_out
-from dro_grasp.arm.tabletop import depth_image, thinned_intrinsics
 from dro_grasp.arm.workcell import VOXEL, Workcell, moved, occupied
 from dro_grasp.cli.main import main
 from dro_grasp.objects.perception.scan import depth_points

@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from dro_grasp.arm.attempts import Attempt
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.robot import Robot, Table, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
 from dro_grasp.arm.table_scene import PickedObject
-from dro_grasp.arm.tabletop import Attempt, TabletopRun, Watcher, attempt
+from dro_grasp.arm.tabletop import Watcher, attempt
+from dro_grasp.arm.tabletop_run import TabletopRun
 from dro_grasp.errors import OutputError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, render

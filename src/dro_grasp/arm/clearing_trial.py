@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
 from dro_grasp.arm.clearing import ClearConfig, Cleared, Pick, clear_table
 from dro_grasp.arm.motion import Trajectory
-from dro_grasp.arm.physics import LiftScene
+from dro_grasp.arm.physics import FRICTION, LiftScene, check_friction
 from dro_grasp.arm.robot import Robot, Table
-from dro_grasp.arm.tabletop import Region, TabletopConfig, Watcher, depth_image, scatter, thinned_intrinsics
+from dro_grasp.arm.table_setup import Region, scatter
+from dro_grasp.arm.tabletop import TabletopConfig, Watcher
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked
@@ -32,8 +34,17 @@ class ClearTrialConfig(Checked):
     """Area where things are put, as in `TabletopConfig`."""
     noise: float | NoiseName = TabletopConfig.noise
     """Noise of the camera's depth, likewise."""
+    friction: float = FRICTION
+    """Coefficient of friction between hand, things and table, likewise."""
+    apart: float = 0.005
+    """Distance between the outlines of things as they are put down [m]; some then come to touch."""
     clear: ClearConfig = field(default_factory=ClearConfig)
     """How it is cleared."""
+
+    def __post_init__(self) -> None:
+        """Refuse friction that is none: OptionError."""
+        super().__post_init__()
+        check_friction(self.friction)
 
 
 @dataclass(frozen=True)
@@ -98,9 +109,9 @@ def clear_trial(
     if clouds := [obj.name for obj in objects if obj.is_cloud]:
         raise OptionError(f"object '{clouds[0]}' is a bare cloud; tables are simulated, and need meshes")
     table = robot.table or Table()
-    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(table.height)])
+    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(table.height)], config.friction)
     names, nothing = tuple(obj.name for obj in objects), (False,) * len(objects)
-    if not scatter(scene, config.region, np.random.default_rng([seed, number])):
+    if not scatter(scene, config.region, np.random.default_rng([seed, number]), config.apart):
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
     rig = SimulatedRig(scene, config.noise, seed + 1000 * number, watch)
     judgements = list[tuple[str, bool]]()

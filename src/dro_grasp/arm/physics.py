@@ -7,6 +7,7 @@ estimated side will do. Ours.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,16 +21,19 @@ from scipy.spatial import ConvexHull
 from dro_grasp.arm.reachability import Feasible, Postures
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, add_solids, moved, robot_spec, wxyz
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 from dro_grasp.simulation.rollout import quiet
 from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, servo_joints
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
-"""Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
+"""Contacts and servos of the hand: density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
 
 Without the solver against slip, held objects creep out of soft contacts; DexGraspBench has two of its iterations."""
+FRICTION = 0.5
+"""Coefficient of friction between hand, object and table [1] (ours), as in `carry`; it is 1 in `LIFT_PROTOCOL`."""
 TICK = 0.02  # Time between targets of the servos [s] (ours)
 DAMPING_TIME = 0.03
 """Damping of an arm's servo over its stiffness [s] (ours); the wanted velocity is fed forward, so nothing lags behind."""
@@ -58,6 +62,12 @@ DEVIATIONS = (Deviation(), Deviation((0.008, 0.0), 0.8, 1.3), Deviation((-0.004,
 Ours: on training objects, half of these shifts let two of 25 grasps pass that lose the true object, and these let none."""
 
 
+def check_friction(friction: float) -> None:
+    """Refuse what is no coefficient of friction: OptionError."""
+    if not 0 < friction < math.inf:
+        raise OptionError(f"friction is {friction}; give a coefficient above 0, such as {FRICTION}")
+
+
 def object_name(index: int) -> str:
     """Name of the body and of the free joint of one of the objects in a scene."""
     return f"object{index}-"
@@ -66,26 +76,30 @@ def object_name(index: int) -> str:
 class LiftScene:
     """Robot, table and objects, and the state that they are in."""
 
-    def __init__(self, cell: Workcell, objects: Sequence[ObjectModel], fixtures: Sequence[ObjectModel] = ()) -> None:
+    def __init__(
+        self, cell: Workcell, objects: Sequence[ObjectModel], fixtures: Sequence[ObjectModel] = (), friction: float = FRICTION,
+    ) -> None:
         """Build the scene of the cell's robot and table, with the robot at home and the objects far away.
 
         Fixtures stand where they are, in the world's frame; they are not among the objects.
         """
         robot = self.robot = cell.robot
         self.objects, self.fixtures = tuple(objects), tuple(fixtures)
-        scene = robot_spec(robot, LIFT_PROTOCOL, robot.table)
+        protocol = replace(  # a slippery pad turns easily too
+            LIFT_PROTOCOL, friction=friction, torsional_friction=friction * LIFT_PROTOCOL.torsional_friction)
+        scene = robot_spec(robot, protocol, robot.table)
         scene.memory = MEMORY
         for body in list(scene.bodies)[1:]:
             body.gravcomp = 1.0  # a robot's controller holds its own weight
         _add_arm_servos(scene, robot)
-        add_servos(scene, robot.hand, LIFT_PROTOCOL)
+        add_servos(scene, robot.hand, protocol)
         if fixtures:
             add_solids(scene, scene.worldbody.add_body(name=FIXTURES), fixtures)
-        self._centres = [_add_thing(scene, obj, i) for i, obj in enumerate(objects)]
+        self._centres = [_add_thing(scene, protocol, obj, i) for i, obj in enumerate(objects)]
         if robot.table is not None:
             board = scene.geom(TABLE)
             # It rolls as on a cloth, so that balls come to rest (ours).
-            board.condim, board.friction = 6, [LIFT_PROTOCOL.friction, 0.005, 0.002]
+            board.condim, board.friction = 6, [friction, 0.005, 0.002]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.model = cell.compiled(scene)
@@ -165,17 +179,17 @@ class LiftScene:
         return sum(self.model.body(other).name.startswith(PREFIX) for other in touching)
 
 
-def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
+def _add_thing(scene: mujoco.MjSpec, protocol: Protocol, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
     """An object that collides as its convex parts, and is seen as its mesh; a bare cloud collides as balls.
 
     Returns:
         Its centre of mass, at which its body's frame is [m].
     """
     if obj.is_cloud:
-        return _add_estimate(scene, obj, index)
+        return _add_estimate(scene, protocol, obj, index)
     assert obj.vertices is not None
     assert obj.faces is not None
-    body = add_object(scene, obj, LIFT_PROTOCOL, object_name(index))
+    body = add_object(scene, obj, protocol, object_name(index))
     for geom in body.geoms:
         geom.group = 3  # cameras do not see the parts
     shape = scene.add_mesh(
@@ -186,10 +200,10 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.n
     return obj.centre_of_mass
 
 
-def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
+def _add_estimate(scene: mujoco.MjSpec, protocol: Protocol, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
     """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put."""
     solid, board = solid_of(obj), scene.geom(TABLE)
-    body = add_object(scene, solid, LIFT_PROTOCOL, object_name(index))
+    body = add_object(scene, solid, protocol, object_name(index))
     for ball in body.geoms:
         ball.contype = ball.conaffinity = BALL_BIT
     cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
@@ -199,7 +213,7 @@ def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[n
     mesh.maxhullvert = HULL_VERTICES
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=4, mass=0.0, contype=HULL_BIT, conaffinity=HULL_BIT,
-        friction=[LIFT_PROTOCOL.friction, LIFT_PROTOCOL.torsional_friction, 1e-4])
+        friction=[protocol.friction, protocol.torsional_friction, 1e-4])
     hand = [geom for geom in scene.geoms if geom.parent is not None and geom.parent.name.startswith(PREFIX) and geom.contype]
     for geom, bit in [*((geom, BALL_BIT) for geom in hand), (board, HULL_BIT)]:
         geom.contype, geom.conaffinity = geom.contype | bit, geom.conaffinity | bit
@@ -222,7 +236,9 @@ def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:
 class Rehearsal:
     """Lifts one object again and again."""
 
-    def __init__(self, cell: Workcell, deviations: Sequence[Deviation] = DEVIATIONS, few_contacts: int = 100) -> None:
+    def __init__(
+        self, cell: Workcell, deviations: Sequence[Deviation] = DEVIATIONS, few_contacts: int = 100, friction: float = FRICTION,
+    ) -> None:
         """Build the scene of robot, table and object, which are all there; obstacles are left out.
 
         Up to `few_contacts` the solver against slip runs: its time grows with their square, and hands that hold have some 20.
@@ -232,7 +248,7 @@ class Rehearsal:
         assert obj is not None
         if obj.is_cloud and not np.array_equal(self.T_world_object, np.eye(4)):  # what stands on a table has its foot there
             obj, self.T_world_object = moved(obj, self.T_world_object), np.eye(4)
-        self.scene = LiftScene(cell, [obj])
+        self.scene = LiftScene(cell, [obj], friction=friction)
         self.scene.model.opt.timestep = 0.004  # [s] (ours)
         self._gravity = self.scene.model.opt.gravity.copy()
         self._friction = self.scene.model.geom_friction.copy()

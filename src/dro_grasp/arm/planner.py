@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
-from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
+from dro_grasp.arm.physics import DEVIATIONS, FRICTION, Deviation, Rehearsal, check_friction
 from dro_grasp.arm.placing import Place, Places, Placing
 from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, carried, reachable_directions
 from dro_grasp.arm.robot import Robot, Table
@@ -70,6 +70,8 @@ class PlanConfig(Checked):
     """Largest number of times that the planner is asked, each time with the next `top` grasps."""
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated, on the object as it is known; 0 for none."""
+    friction: float = FRICTION
+    """Coefficient of friction between hand, object and table, for rehearsals."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
     """How the rehearsals of one grasp deviate from what is known."""
     trusted_share: float = 0.5
@@ -107,6 +109,7 @@ class PlanConfig(Checked):
         if self.constraints.direction is not None and self.directions != "all":
             raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
         check_confidence(self.least_confidence or 0.0)
+        check_friction(self.friction)
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
@@ -233,7 +236,7 @@ class Task:
     def rehearsal(self) -> Rehearsal | None:
         """The simulated lift, where lifts are rehearsed."""
         wanted = self.config.rehearsals > 0 and self.config.order == "score" and self.robot.table is not None
-        return Rehearsal(self.cell, self.config.deviations) if wanted else None
+        return Rehearsal(self.cell, self.config.deviations, friction=self.config.friction) if wanted else None
 
     def check_start(self) -> None:
         """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.inputs import Flag, Friction, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class Clear:
     tries: int = 3  # Picks of a thing that may fail before it is given up.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8  # Grasps of each batch whose lift is simulated on the object as it is known; 0 for none.
+    friction: Friction = 0.5
     seed: int = 0  # Seed of all draws.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
@@ -95,7 +96,8 @@ class Clear:
         from dro_grasp.arm.planner import PlanConfig
 
         box = Bin() if self.bin is None else Bin(self.bin[:2], self.bin[2:4], self.bin[4])
-        return ClearTrialConfig(clear=ClearConfig(box, self.tries, plan=PlanConfig(self.num, rehearsals=self.rehearsals)))
+        plan = PlanConfig(self.num, rehearsals=self.rehearsals, friction=self.friction)
+        return ClearTrialConfig(friction=self.friction, clear=ClearConfig(box, self.tries, plan=plan))
 
     def _report(self, done: list[dict[str, Any]]) -> None:
         from dro_grasp.compare.metrics import wilson_interval

@@ -19,6 +19,8 @@ else:
 
 Ball = tuple[float, float, float, float]  # Centre and radius [m]
 Mass = Annotated[float | None, tyro.conf.arg(metavar="KG", help_behavior_hint="(default: density times volume)")]
+Friction = Annotated[float, tyro.conf.arg(
+    metavar="MU", help="Friction between hand, objects and table, in simulation and in the planner's rehearsals.")]
 Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, PalmOptions, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
+    from dro_grasp.arm.attempts import Attempt
     from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.arm.robot import Robot
     from dro_grasp.arm.table_scene import PickedObject
-    from dro_grasp.arm.tabletop import Attempt
 
 
 FLOATS = 0.1
@@ -69,6 +69,8 @@ class Plan:
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none."""
+    friction: Annotated[float, tyro.conf.arg(metavar="MU")] = 0.5
+    """Friction between hand, object and table, in simulated lifts."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
@@ -108,8 +110,8 @@ class Plan:
         scene = None if self.scene is None else load_scene(self.scene)
         constraints = self.constraints.constraints(obstacles=scene)
         config = PlanConfig(
-            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds,
-            least_confidence=self.least_confidence)
+            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, friction=self.friction,
+            planner_seconds=self.planner_seconds, least_confidence=self.least_confidence)
         for option, place in (("--at", self.at), ("--near", self.near)):
             if place is not None and not all(map(math.isfinite, place)):
                 raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
@@ -248,6 +250,7 @@ class Tabletop:
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
+    friction: Friction = 0.5
     region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
     """Two corners of the area where objects are put, from the arm's base [m]. A small arm needs a nearer one."""
     clutter: int = 0
@@ -277,7 +280,8 @@ class Tabletop:
         require_extra("arm")
         from dro_grasp.arm.animation import FORMATS, draw_attempt
         from dro_grasp.arm.planner import PlanConfig
-        from dro_grasp.arm.tabletop import TabletopConfig, TabletopRun, run_tabletop
+        from dro_grasp.arm.tabletop import TabletopConfig
+        from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
@@ -285,8 +289,8 @@ class Tabletop:
             check_output(self.video, *FORMATS)
         config = TabletopConfig(
             self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
-            mass=self.mass, slide=not self.no_slide, place=self.place, plan=PlanConfig(
-                self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
+            mass=self.mass, friction=self.friction, slide=not self.no_slide, place=self.place, plan=PlanConfig(
+                self.num, friction=self.friction, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
@@ -298,7 +302,7 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.arm.tabletop import endings, failures, lifted, placing_errors, processor_seconds
+        from dro_grasp.arm.attempts import endings, failures, lifted, placing_errors, processor_seconds
         from dro_grasp.compare.metrics import wilson_interval
 
         held = sum(a.success for a in done)

@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
+from dro_grasp.arm.attempts import Attempt, read_attempts
 from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.reachability import carried
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
-from dro_grasp.arm.tabletop import Attempt, TabletopConfig, attempt, read_attempts
+from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.network.checkpoints import describe_weights
