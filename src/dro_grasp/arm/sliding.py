@@ -214,17 +214,18 @@ class _Pusher:
             middle = float(self.tips[:, ACROSS].max() + self.tips[:, ACROSS].min()) / 2
             half = float(np.ptp(self.tips[:, ACROSS])) / 2
             lateral = float(self.obj.centre_of_mass @ across)
-            met = self.points[np.abs(self.points @ across - lateral) < half]
-            rear = float(((met if len(met) else self.points) @ push.direction).min())
+            rear, end = (_met(points, push.direction, points @ across - lateral, half) for points in (
+                self.points, self.points @ push.motion[:3, :3].T + push.motion[:3, 3]))
             T[:3, 3] = (rear - config.behind - front) * push.direction + (lateral - middle) * across
             T[2, 3] = table.height + self.ahead + config.hover
-            if (line := self._solved(T, push)) is not None:
+            # A long thing has to turn on the way: fingers go to where its turned side will be.
+            if (line := self._solved(T, (end - rear + config.behind + config.further) * push.direction)) is not None:
                 yield line
 
-    def _solved(self, T: Float[np.ndarray, "4 4"], push: Push) -> Line | None:
+    def _solved(self, T: Float[np.ndarray, "4 4"], way: Float[np.ndarray, "3"]) -> Line | None:
         """Configurations from above a wrist pose to where the push ends and up again, if there are any without collisions."""
         config, robot = self.config, self.robot
-        ahead = _line(T, (push.length + config.behind + config.further) * push.direction, config.step)
+        ahead = _line(T, way, config.step)
         up = np.array([0.0, 0.0, config.above])
         seeds = [robot.home, *self.random.uniform(*robot.working_range, (config.seeds - 1, len(robot.home)))]
         for seed in seeds:
@@ -283,6 +284,14 @@ class _Pusher:
         n = len(self.robot.hand_joints)
         others = np.concatenate([np.zeros((0, 3)), *(thing.cloud for thing in self.obstacles)])
         return PlanScene(self.points, others, np.zeros((0, 4, 4)), np.zeros((0, n)), np.zeros(0), ())
+
+
+def _met(
+    points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"], aside: Float[np.ndarray, " n"], half: float
+) -> float:
+    """How far along a direction the first of the points is that a row of fingers meets [m]."""
+    within = np.abs(aside) < half
+    return float(((points[within] if within.any() else points) @ direction).min())
 
 
 def _line(T: Float[np.ndarray, "4 4"], motion: Float[np.ndarray, "3"], step: float) -> Float[np.ndarray, "k 4 4"]:
