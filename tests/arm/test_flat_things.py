@@ -61,6 +61,7 @@ def test_overhang_is_the_way_out_of_the_rectangle() -> None:
 def test_a_card_is_seen_to_a_millimetre() -> None:
     """Depth has more noise than the card is thick; its pixels know better."""
     obj = flat_object("card", card_points(np.random.default_rng(1)), EYE, TABLE.height)
+    assert obj.vertices is not None
     along = np.array([math.cos(0.5), math.sin(0.5)])
     sides = obj.vertices[:, :2] @ np.stack([along, [-along[1], along[0]]]).T
     assert np.allclose(np.ptp(sides, axis=0), (0.086, 0.054), atol=0.0025)

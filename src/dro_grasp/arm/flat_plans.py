@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from dro_grasp.arm.flat_grips import flat_grasps, overhangs
-from dro_grasp.arm.flat_things import height_of, lies_flat
+from dro_grasp.arm.flat_things import height_of, lies_flat, width_of
 from dro_grasp.arm.motion import MotionPlan, grasps_and_dropped
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import PlanConfig, Task, Tries, add, candidates, motion, plan, reachable, rehearsed, trusted
@@ -31,6 +31,10 @@ from dro_grasp.predict.predictor import GraspPredictor
 REHEARSED = 24  # Grasps at an edge whose lift is simulated (ours): one takes a tenth of a second
 UNLIKELY = 0.02
 """Height up to which grasps from above are not looked for before a push [m] (ours): round fingertips slip off such edges."""
+
+
+WIDEST = 0.09
+"""Width up to which they are looked for at all [m] (ours): hands of a person's size clasp nothing flat that is wider."""
 
 
 @checked
@@ -95,7 +99,7 @@ def plan_or_slide(
         grasps = flat_grasps(hand, thing, table, seed)
         ways = [lambda: _trusted(robot, thing, obstacles, predictor, at_edge, seed, start, place, grasps), pushed,
                 lambda: plan(robot, thing, None, obstacles, predictor, at_edge, seed, grasps, start, place)]
-    elif height_of(points, table.height) > UNLIKELY:
+    elif height_of(points, table.height) > UNLIKELY and width_of(points) < WIDEST:
         ways.insert(0, trusted_alone)
     faults = list[str]()
     for way in ways:

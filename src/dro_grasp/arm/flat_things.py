@@ -40,6 +40,12 @@ def height_of(points: Float[np.ndarray, "n 3"], table: float) -> float:
     return float(np.quantile(points[:, 2], 0.9)) - table
 
 
+def width_of(points: Float[np.ndarray, "n 3"]) -> float:
+    """Extent of points across their longest, as seen from above [m]."""
+    spread = points[:, :2] - points[:, :2].mean(0)
+    return float(np.ptp(spread @ np.linalg.svd(spread, full_matrices=False)[2][1]))
+
+
 def lies_flat(points: Float[np.ndarray, "n 3"], table: float) -> bool:
     """Whether a thing ends so low above the table that it counts as flat."""
     return height_of(points, table) < LOW

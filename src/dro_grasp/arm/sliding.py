@@ -54,6 +54,10 @@ class SlideConfig(Checked):
     """Height at which collisions are looked for [m]; the rest of the way down is short."""
     press: float = 0.001
     """Depth in the table that the fingertips aim at, so that they touch it [m]."""
+    press_thin: float = 0.003
+    """The same for what is thinner than `thin`: fingertips that press little slide over its edge [m]."""
+    thin: float = 0.0015
+    """Height of what is thin [m]."""
     further: float = 0.006
     """How much farther the fingers aim, since they give way [m]."""
     behind: float = 0.02
@@ -239,7 +243,8 @@ class _Pusher:
                 continue
             if not self.cell.free(before[-1], robot.open_hand, 0.0) or not self.cell.free(after[-1], robot.open_hand, 0.0):
                 continue
-            ahead[:, 2, 3] -= config.hover + config.press
+            is_thin = float(np.ptp(self.points[:, 2])) < config.thin
+            ahead[:, 2, 3] -= config.hover + (config.press_thin if is_thin else config.press)
             pressed = self.solver.follow(ahead, hovering[0])
             if pressed is not None:
                 return before[::-1].copy(), pressed, after

@@ -39,7 +39,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 LABEL = "tabletop/4 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
-PUSHES = 4  # Most pushes of a flat thing towards an edge (ours)
+PUSHES = 6  # Most pushes of a flat thing towards an edge (ours)
 FALLEN = 0.02  # Depth below the table from which on it fell off [m] (ours)
 
 
