@@ -28,6 +28,8 @@ HARD = "builtin:hard_test"
 """Thin, flat, hollow, small, large and heavy ones, by which nothing was chosen."""
 MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
+FLAT_THINGS = ("ballpoint_pen", "bank_card", "dinner_plate", "table_fork", "hardcover_book", "scissors")
+"""Flat and thin things, by which nothing was chosen."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
 """Built-in arms with hands."""
 ROBOT_HANDS = ("leaphand", "allegro")
@@ -172,6 +174,9 @@ MEASUREMENTS = {
     "flat": Measurement("Flat and thin things on a table, from above, carried", {
         _short(hand): f"python -m lab.benchmarks.tabletop --hands {hand} --objects ballpoint_pen bank_card dinner_plate "
         "table_fork hardcover_book scissors --num 8 --sides above --trials carry --json" for hand in FLAT_HANDS}),
+    "flat_lifts": Measurement("Flat and thin things that an arm takes from a table, after a push to its edge if need be", {
+        f"{robot}, {name}": f"python -m lab.benchmarks.flat_lifts --robot {robot} --object {name} --attempts 5 --json"
+        for robot in ROBOTS for name in FLAT_THINGS}, wings=("arm", "compare")),
     "methods": Measurement("Methods of others, written anew here, beside ours", {
         f"{method}, {_short(hand)}": _benchmark(source, hand, OBJECTS["validate"], f"--num {num} --stages raw returned "
                                                 f"--protocols {FAST} dro")

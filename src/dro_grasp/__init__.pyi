@@ -12,6 +12,7 @@ from .arm.clearing import (
     Rig as Rig,
     clear_table as clear_table,
 )
+from .arm.flat_plans import plan_or_slide as plan_or_slide
 from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
 from .arm.planner import PlanConfig as PlanConfig, plan as plan
 from .arm.reachability import ReachConfig as ReachConfig

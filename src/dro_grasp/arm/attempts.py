@@ -60,6 +60,8 @@ class Attempt:
     """Angle between the placed object's upright and the one it had [degrees], likewise."""
     place_turn: float | None = None
     """How far it is turned about the vertical from what was planned [degrees], likewise."""
+    pushes: int = 0
+    """How often it was pushed towards an edge of the table before it was grasped."""
     pushed: float = 0.0
     """Largest displacement of another object [m]."""
     robot_file: str = ""

@@ -28,7 +28,10 @@ STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
 PLACING = ("carry", "lower", "release", "retreat")
 """What follows where the object is put somewhere: the arm carries it there; straight down; the hand opens; straight back."""
-ALL_STAGES = (*STAGES, *PLACING)  # Those that a plan can have, in their order
+ALL_STAGES = (*STAGES, *PLACING)  # Those that a plan of a lift can have, in their order
+SLIDING = ("reach", "shape", "approach", "press", "slide", "retreat", "look again")
+"""Stages of a plan that pushes a flat thing: the arm travels with the hand open; the fingers point down; down beside the thing;
+onto the table; straight to the edge; straight up; home, with the hand open, so that the camera sees what became of it."""
 FORMAT = 3  # Version of plan files
 READ = (2, FORMAT)  # Versions that are read: plans of the second put nothing anywhere
 CHOSEN = "chosen"  # Fate of the grasp that the motion carries out
@@ -67,7 +70,7 @@ class MotionPoint:
     """Where arm and hand should be at one time, as the drivers count it."""
 
     time: float  # Since the start [s]
-    stage: str  # One of ALL_STAGES
+    stage: str  # One of the plan's
     arm: Float[np.ndarray, " n_arm"]  # [rad or m, unless the robot file states other units]
     hand: Float[np.ndarray, " n_dof"]  # Likewise
     hand_effort: Float[np.ndarray, " n_dof"] | None = None  # [Nm or N]; None if the plan knows none
@@ -101,6 +104,8 @@ class PlanNotes:
     """See `Drivers`, of arm and hand; None where drivers count as the description does."""
     scales: tuple[float, ...] | None = None
     """Likewise."""
+    slide: list[list[float]] | None = None
+    """Motion of the object, 4x4 in the world [m], where it is pushed to the table's edge, not grasped; None otherwise."""
     hold: dict[str, tuple[float, ...]] | None = None
     """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
     T_world_held: list[list[float]] | None = None
@@ -129,7 +134,7 @@ class MotionPlan:
     scene: PlanScene
     """Object, obstacles and all grasps, in the world."""
     stage: Int[np.ndarray, " k"]
-    """Index into ALL_STAGES of each sample."""
+    """Index into `stages` of each sample."""
     arm: Trajectory
     """Time, position, velocity and acceleration of the arm's joints."""
     hand: Trajectory
@@ -143,7 +148,7 @@ class MotionPlan:
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of its stages, in their order."""
-        return ALL_STAGES if self.notes.place is not None else STAGES
+        return _stages(self.notes.place is not None, self.notes.slide is not None)
 
     @property
     def squeeze(self) -> Float[np.ndarray, " n_dof"]:
@@ -186,7 +191,8 @@ class MotionPlan:
 
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
-        first, end = (int(np.searchsorted(self.stage, ALL_STAGES.index(stage), side)) for side in ("left", "right"))
+        number = (SLIDING if self.notes.slide is not None else ALL_STAGES).index(stage)
+        first, end = (int(np.searchsorted(self.stage, number, side)) for side in ("left", "right"))
         return slice(max(0, first - 1), end)
 
     @property
@@ -214,7 +220,7 @@ class MotionPlan:
         count = int(np.ceil(self.seconds * rate - 1e-9))
         for time in [*(i / rate for i in range(count)), self.seconds]:
             row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
-            yield MotionPoint(float(time), ALL_STAGES[int(self.stage[row])], *(
+            yield MotionPoint(float(time), self.stages[int(self.stage[row])], *(
                 np.array([np.interp(time, self.arm.time, column) for column in table.T]) for table in columns))
 
     def lines(self) -> list[str]:
@@ -222,6 +228,10 @@ class MotionPlan:
         n = self.notes
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in self.stages)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
+        if n.slide is not None:
+            return [f"no grasp of it is trusted: it is pushed by {100 * np.hypot(n.slide[0][3], n.slide[1][3]):.0f} cm to the "
+                    "table's edge; then look again, and plan again",
+                    f"motion of {self.seconds:.1f} s: {spans}"]
         forces = f"; it {told}" if (told := forces_in_words(n.payload, n.squeeze_force)) else ""
         put = [] if n.place is None else [_place_in_words(np.array(n.place), self.scene.points)]
         return [
@@ -258,7 +268,8 @@ class MotionPlan:
         with expected, path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
             stages = tuple(header.pop("stages", ()))
-            if header.pop("format_version", None) not in READ or stages != (ALL_STAGES if header.get("place") else STAGES):
+            if header.pop("format_version", None) not in READ or stages != _stages(
+                    bool(header.get("place")), bool(header.get("slide"))):
                 raise PlanError(f"{path} is a plan file of another version; plan again")
             time, stage, *rows = (file[name] for name in COLUMNS)
             scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
@@ -269,6 +280,10 @@ class MotionPlan:
                 header["hold"] = {name: tuple(row) for name, row in hold.items()}
             arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
+
+
+def _stages(places: bool, slides: bool) -> tuple[str, ...]:
+    return SLIDING if slides else ALL_STAGES if places else STAGES
 
 
 def _place_in_words(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> str:
@@ -311,7 +326,7 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
             messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
                               "position": _plain(of_hand.positions(joints)), "effort": _plain(of_hand.efforts(forces))}
     units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
-    does = "lifts" if notes.place is None else "lifts and places"
+    does = "pushes" if notes.slide is not None else "lifts" if notes.place is None else "lifts and places"
     return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
@@ -329,7 +344,7 @@ def trajectory_csv(plan: MotionPlan) -> str:
     table.writerow(["time", "stage", *joints])
     for i, time in enumerate(plan.arm.time.tolist()):
         values = _plain(np.concatenate([column[i] for column in columns]))
-        table.writerow([round(time, DIGITS), ALL_STAGES[int(plan.stage[i])], *values])
+        table.writerow([round(time, DIGITS), plan.stages[int(plan.stage[i])], *values])
     return text.getvalue()
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dro_grasp.arm.placing import Places
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import CARRIED, VOXEL, Workcell, arm_addresses
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
@@ -147,7 +147,7 @@ class Reachability:
         tests = [(Fault.HITS_OBSTACLE, self._obstacle_distance(points) < self.config.obstacle_margin),
                  (Fault.HITS_OBJECT, depth > self.config.deepest)]
         if (table := cell.robot.table) is not None:
-            tests.insert(0, (Fault.BELOW_TABLE, lowest_points(hand, grasps) <= table.height + self.config.table_margin))
+            tests.insert(0, (Fault.BELOW_TABLE, lowest_points(hand, grasps, table) <= table.height + self.config.table_margin))
         found: dict[int, str] = {}
         for reason, failed in tests:
             for row in failed.nonzero()[:, 0].tolist():
@@ -358,10 +358,12 @@ def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int 
     return near[farthest_points(near, 8)]
 
 
-def lowest_points(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
-    """Height of the hand's lowest point in pregrasp, grasp and squeeze of complete grasps [m]."""
+def lowest_points(hand: Hand, grasps: GraspBatch, table: Table) -> Float[Tensor, " n"]:
+    """Height of the hand's lowest point over the table in pregrasp, grasp and squeeze of complete grasps in the world [m]."""
     postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
-    return torch.stack([hand.points(q, grasps.T_object_wrist)[..., 2].amin(-1) for q in postures]).amin(0)
+    points = torch.stack([hand.points(q, grasps.T_object_wrist) for q in postures], 1).flatten(1, 2)
+    over = ((points[..., :2] - torch.tensor(table.centre)).abs() < torch.tensor(table.size) / 2).all(-1)
+    return torch.where(over, points[..., 2], torch.inf).amin(-1)
 
 
 def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

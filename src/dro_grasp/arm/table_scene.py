@@ -8,16 +8,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.arm.flat_things import overhang, seen_flat
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import VOXEL
 from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
-from dro_grasp.objects.perception.choosing import Pixel, Spot
+from dro_grasp.objects.perception.choosing import Pixel, Spot, within
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
 LEVEL = 0.98  # Least cosine between a table's normal and the vertical [1] (ours): 11 degrees
+OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
+BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,8 @@ def pick_object(
         robot: With a table.
         at: A place on the object or near it, in the world: x, y, z [m].
         pixel: A pixel that shows it: column and row, from the upper left.
-        mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG.
+        mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG. It also shows what is too flat
+            for the camera's depth, such as a card.
         nearest: Take what is nearest to the camera.
         name: What to call it; the scene's name by default.
 
@@ -58,7 +62,10 @@ def pick_object(
         OptionError: Two choices are given, or the scene lacks what one of them needs.
         RobotError: The robot has no table.
     """
-    return as_picked(seen_on_table(scene, robot).object_at(at, pixel=pixel, mask=mask, nearest=nearest, name=name), robot)
+    seen = seen_on_table(scene, robot)
+    if mask is not None and (flat := picked_flat(seen, robot, mask, name)) is not None:
+        return flat
+    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, name=name), robot)
 
 
 def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
@@ -69,8 +76,19 @@ def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
     return PickedObject(found.obj, _solid(others, level.table.height), level)
 
 
+def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) -> PickedObject | None:
+    """An object of which the pixels are known, if it lies flat on the table; None for others, and where no camera saw it."""
+    table, sight = _table(robot, scene.name), scene.sight
+    if sight is None or not sight.from_camera:
+        return None
+    flat = seen_flat(name or scene.name, sight.world(), within(scene.name, sight, mask), table, sight.T[:3, 3])
+    if flat is None:
+        return None
+    return PickedObject(flat.obj, flat.others, replace(robot, table=replace(table, height=flat.table)))
+
+
 def seen_on_table(scene: Scene, robot: Robot) -> Scene:
-    """What of a scene in the world is over or under the rectangle of the table.
+    """What of a scene in the world is over or under the rectangle of the table, or overhangs it.
 
     Raises:
         ObjectError: Nothing is.
@@ -79,7 +97,9 @@ def seen_on_table(scene: Scene, robot: Robot) -> Scene:
     table = _table(robot, scene.name)
     if scene.sight is None:
         return scene  # which says of itself that it is a mesh
-    kept = np.asarray((np.abs(scene.sight.world()[:, :2] - table.centre) < np.array(table.size) / 2).all(1))
+    world = scene.sight.world()
+    beyond = overhang(world, table)
+    kept = (beyond < 0) | ((beyond < OVERHANG) & (world[:, 2] > table.height - BELOW))
     if not kept.any():
         raise ObjectError(f"'{scene.name}' shows nothing of the table at {table.centre} m; correct the camera's pose in the "
                           "robot file, or the table's place")

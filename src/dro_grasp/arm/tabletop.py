@@ -17,12 +17,13 @@ from jaxtyping import Float
 
 from dro_grasp.arm.attempts import Attempt
 from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
-from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan
+from dro_grasp.arm.flat_plans import plan_or_slide
+from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
 from dro_grasp.arm.physics import FRICTION, TICK, Deviation, LiftScene, check_friction
 from dro_grasp.arm.placed import draw_place, measured, place_fault
 from dro_grasp.arm.planner import PlanConfig, plan
 from dro_grasp.arm.reachability import ReachConfig
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.table_scene import PickedObject, pick_object
 from dro_grasp.arm.table_setup import Region, other_objects, scatter
 from dro_grasp.arm.workcell import Workcell, moved
@@ -38,6 +39,8 @@ from dro_grasp.predict.predictor import GraspPredictor
 LABEL = "tabletop/4 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
+PUSHES = 6  # Most pushes of a flat thing towards an edge (ours)
+FALLEN = 0.02  # Depth below the table from which on it fell off [m] (ours)
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ class TabletopConfig(Checked):
     """Mass of the object to grasp, which the planner knows [kg]; None for density times volume."""
     friction: float = FRICTION
     """Coefficient of friction between hand, objects and table; what the planner assumes is in `plan`."""
+    slide: bool = True
+    """Whether what lies flat is pushed to an edge of the table where no grasp of it is trusted."""
     place: bool = False
     """Whether the object is put down at a random free place of the region, instead of held and shaken."""
 
@@ -93,7 +98,8 @@ class TabletopConfig(Checked):
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
         # What is not asked for is left out: attempts of before it could be are not repeated.
-        given = {name: value for name, value in asdict(self).items() if (name, value) not in (("mass", None), ("place", False))}
+        usual = (("mass", None), ("place", False), ("slide", True))
+        given = {name: value for name, value in asdict(self).items() if (name, value) not in usual}
         return LABEL + json.dumps(given, sort_keys=True)
 
     @staticmethod
@@ -151,14 +157,25 @@ def attempt(
         return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
     start, *beside = (scene.pose(i) for i in range(len(scene.objects)))
     result = replace(result, place=json.dumps(start.round(6).tolist()))
-    begin, processor = time.perf_counter(), time.process_time()
     try:
-        seen, T = _see(scene, config, int(draw.integers(2**31)))
-        see_seconds = time.perf_counter() - begin
-        result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-        grasps = None if proposer is None else proposer(seen, T, seed + number)
-        place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
-        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
+        while True:
+            begin, processor = time.perf_counter(), time.process_time()
+            seen, T = _see(scene, config, int(draw.integers(2**31)))
+            see_seconds = time.perf_counter() - begin
+            result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
+            grasps = None if proposer is None else proposer(seen, T, seed + number)
+            place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
+            if grasps is None and config.slide:
+                made = plan_or_slide(
+                    seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, place=place)
+            else:
+                made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
+            if made.notes.slide is None:
+                break
+            if watch is not None:
+                watch.planned(seen, made)
+            if (result := _pushed(result, scene, made, watch)).reason:
+                return result
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -175,6 +192,18 @@ def attempt(
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
     pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
+
+
+def _pushed(result: Attempt, scene: LiftScene, made: MotionPlan, watch: Watcher | None) -> Attempt:
+    """An attempt after a push to the table's edge."""
+    for stage in SLIDING:
+        _follow(scene, made, stage, None if watch is None else lambda: watch.moved(scene))
+    table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
+    if scene.pose(0)[2, 3] < table.height - FALLEN:
+        return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
+    if result.pushes > PUSHES:
+        return replace(result, stage="slide", reason=f"the object is not ready to be taken at the edge after {PUSHES} pushes")
+    return result
 
 
 def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:

@@ -25,6 +25,14 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
     """The stages of a plan for a robot, in their order, as plain values: metres, radians, quaternions WXYZ, Nm or N."""
     hand, thing, wrist = robot.hand_joints, plan.notes.object, robot.hand.wrist_link
     links, frame = list(robot.hand.tree.link_names), plan.notes.frame
+    if plan.notes.slide is not None:
+        return [{"name": "current state", "type": "CurrentState"}] + [stage | {"frame": frame} for stage in (
+            _joints("open", HAND, hand, _last(plan, HAND, "reach")), _pose("reach", plan, robot, "reach"),
+            _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
+            {"name": "hand may touch", "type": "ModifyPlanningScene",
+             "allow_collisions": {"first": thing, "second": links}},
+            *(part for name in ("approach", "press", "slide", "retreat") for part in _straight(name, plan, robot, name)),
+            _pose("look again", plan, robot, "look again"))]
     allowed = {"allow_collisions": {"first": thing, "second": links}}
     stages = [
         {"name": "current state", "type": "CurrentState"},
@@ -50,7 +58,7 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
 
 def task_yaml(plan: MotionPlan, robot: Robot) -> str:
     """The stages of a plan as YAML."""
-    does = "lift" if plan.notes.place is None else "lift and place"
+    does = "push" if plan.notes.slide is not None else "lift" if plan.notes.place is None else "lift and place"
     return (f"# Stages of a task: {does} '{plan.notes.object}' with robot '{robot.name}'. Types are those of MoveIt Task "
             "Constructor.\n# Metres, radians, Nm or N; quaternions WXYZ; joints as the robot's description counts them.\n"
             + yaml_text({"groups": {ARM: list(robot.arm_joints), HAND: list(robot.hand_joints)},

@@ -70,6 +70,9 @@ class Plan:
     any without YAW."""
     place_on: Annotated[str | None, optional("SURFACE", "--place says where")] = None
     """Put it on a free place that is chosen: `table`, or the name of one of --obstacles."""
+    no_slide: Flag = False
+    """Do not push what lies flat to an edge of the table. By default a plan does that, and nothing else, where no grasp is
+    trusted: look again after it, and plan again."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
@@ -99,6 +102,7 @@ class Plan:
 
     def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
         """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
+        from dro_grasp.arm.flat_plans import plan_or_slide
         from dro_grasp.arm.placing import Place
         from dro_grasp.arm.planner import PlanConfig, plan
         from dro_grasp.arm.robot import load_robot
@@ -143,7 +147,7 @@ class Plan:
                       "say where it is (--camera, --pose, --at)")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        made = (make or plan)(
+        made = (make or (plan if self.no_slide else plan_or_slide))(
             robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed, start=self.start,
             place=self.place or self.place_on)
         written = self._write(made, robot)
@@ -194,7 +198,7 @@ class Plan:
         import numpy as np
 
         from dro_grasp.arm.robot import Table
-        from dro_grasp.arm.table_scene import PickedObject, as_picked, at_seen_height, seen_on_table
+        from dro_grasp.arm.table_scene import PickedObject, as_picked, at_seen_height, picked_flat, seen_on_table
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
@@ -204,7 +208,8 @@ class Plan:
         T, camera = np.eye(4), self._camera(robot)
         if self.scene is not None:
             scene = seen_on_table(load_scene(self.scene, camera=camera), robot)
-            return as_picked(find_thing(scene, self), robot), T
+            flat = None if self.mask is None else picked_flat(scene, robot, self.mask)
+            return (as_picked(find_thing(scene, self), robot) if flat is None else flat), T
         assert self.object is not None
         if camera is not None:
             obj = load_scan(given_path(self.object), camera.T_frame_camera)
@@ -254,6 +259,7 @@ class Tabletop:
     place: Flag = False
     """Put each object down at a random free place, 15 cm away at least, instead of holding and shaking it. It succeeds within
     2 cm and 15 degrees, upright."""
+    no_slide: Flag = False  # Do not push what lies flat to an edge of the table where no grasp of it is trusted.
     mass: Mass = None  # Mass of each object to lift [kg], which its grasps shall carry.
     num: int = 24  # Grasps to choose from, in each of up to three batches.
     rehearsals: int = 8
@@ -264,7 +270,8 @@ class Tabletop:
     clutter: int = 0
     """Number of other built-in objects that stand around the one to grasp: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
-    """How the object's points are separated from others: by distance (cluster), or by the true mask."""
+    """How the object's points are separated from others: by distance (cluster), or by the true mask, which also shows what is
+    too flat for the camera's depth."""
     noise: float | Literal["none", "structured_light", "time_of_flight", "stereo"] = "stereo"
     """Noise of the camera's depth: that of a kind of camera, or a standard deviation alike for all pixels [m]."""
     seed: int = 0  # Seed of all draws.
@@ -296,7 +303,7 @@ class Tabletop:
             check_output(self.video, *FORMATS)
         config = TabletopConfig(
             self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
-            mass=self.mass, friction=self.friction, place=self.place, plan=PlanConfig(
+            mass=self.mass, friction=self.friction, slide=not self.no_slide, place=self.place, plan=PlanConfig(
                 self.num, friction=self.friction, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))
         run = TabletopRun(

@@ -201,7 +201,13 @@ def _nearest(name: str, sight: Sight, segments: Segments) -> int:
     return int(np.argmin([np.quantile(away[segments.labels == k], 0.05) for k in range(segments.count)]))
 
 
-def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
+def within(name: str, sight: Sight, mask: Any) -> Bool[np.ndarray, " n"]:
+    """Which points of a sight a mask is true on.
+
+    Raises:
+        ObjectError: The mask has another size than the image.
+        OptionError: The sight has no image.
+    """
     from dro_grasp.objects.perception.scene_files import read_mask
 
     if sight.shape is None:
@@ -210,7 +216,11 @@ def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.nd
     wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else numbers(mask, "the mask", "biuf") != 0
     if wanted.shape != sight.shape:
         raise ObjectError(f"the mask has shape {wanted.shape}, the image {sight.shape}; give one of the same size")
-    own = np.flatnonzero(wanted.ravel()[sight.pixels] & (segments.labels != STRUCTURE))
+    return np.asarray(wanted.ravel()[sight.pixels])
+
+
+def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
+    own = np.flatnonzero(within(name, sight, mask) & (segments.labels != STRUCTURE))
     if len(own) < LEAST_MASK:
         raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
                           f"needed; give one that is true on the object. '{name}' shows {listed(sight, segments)}")

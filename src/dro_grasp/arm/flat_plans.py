@@ -1,0 +1,132 @@
+"""What to do about a flat thing: take it where it overhangs, push it to an edge otherwise, or grasp it as other things.
+
+One call makes one motion. After a push, look again and call again. Ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dro_grasp.arm.flat_grips import flat_grasps, overhangs
+from dro_grasp.arm.flat_things import height_of, lies_flat, width_of
+from dro_grasp.arm.motion import MotionPlan, grasps_and_dropped
+from dro_grasp.arm.placing import Place
+from dro_grasp.arm.planner import PlanConfig, Task, Tries, add, candidates, motion, plan, reachable, rehearsed, trusted
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.sliding import AT_TABLE, slide
+from dro_grasp.arm.workcell import moved
+from dro_grasp.errors import NoGraspError, OptionError, PlanError
+from dro_grasp.extras import require_extra
+from dro_grasp.frames import motion_fault
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import checked
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.predictor import GraspPredictor
+
+REHEARSED = 24  # Grasps at an edge whose lift is simulated (ours): one takes a tenth of a second
+UNLIKELY = 0.02
+"""Height up to which grasps from above are not looked for before a push [m] (ours): round fingertips slip off such edges."""
+
+
+WIDEST = 0.09
+"""Width up to which they are looked for at all [m] (ours): hands of a person's size clasp nothing flat that is wider."""
+
+
+@checked
+def plan_or_slide(
+    robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
+    obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
+    seed: int = 0, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+    place: Sequence[float] | str | Place | None = None,
+) -> MotionPlan:
+    """As `plan`; but what lies flat is taken where it overhangs the table's edge, or pushed there if no grasp is trusted.
+
+    A plan whose `notes.slide` is not None pushes: carry it out, look again, and call again with what is seen then. Where the
+    edges are, the robot's table says.
+
+    Examples:
+        >>> made = plan_or_slide(robot, obj)
+        >>> if made.notes.slide is not None:  # push, look, and plan again
+        ...     obj = look_again(made)
+
+    Args:
+        robot: Arm, hand and table.
+        obj: A mesh, or a camera's cloud.
+        T_world_object: Where it stands [m]; its frame is the world's by default.
+        obstacles: As for `plan`.
+        predictor: As for `plan`.
+        config: As for `plan`.
+        seed: As for `plan`.
+        start: As for `plan`.
+        place: As for `plan`; a push ignores it.
+
+    Raises:
+        PlanError: As for `plan`; the message tells why it was not pushed, either.
+        RobotError: As for `plan`.
+        OptionError: As for `plan`.
+    """
+    require_extra("arm")
+    T = np.eye(4) if T_world_object is None else T_world_object
+    if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
+        raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
+    config, table = config or PlanConfig(), robot.table
+
+    def usual() -> MotionPlan:
+        return plan(robot, obj, T, obstacles, predictor, config, seed, start=start, place=place)
+
+    hand = robot.hand
+    if table is None or hand.thumb is None or len(hand.fingers) < 3:
+        return usual()
+    thing = moved(obj, T)
+    points = np.asarray(thing.cloud, np.float64)
+    if not lies_flat(points, table.height):
+        return usual()
+
+    def trusted_alone() -> MotionPlan:
+        return _trusted(robot, thing, obstacles, predictor, config, seed, start, place)
+
+    def pushed() -> MotionPlan:
+        return slide(robot, thing, obstacles, seed=seed, start=None if start is None else robot.require_start(start))
+
+    ways = [pushed, usual]
+    if overhangs(points, table):
+        at_edge = replace(config, reach=replace(AT_TABLE, lift=config.reach.lift), rehearsals=config.rehearsals and REHEARSED)
+        grasps = flat_grasps(hand, thing, table, seed)
+        ways = [lambda: _trusted(robot, thing, obstacles, predictor, at_edge, seed, start, place, grasps), pushed,
+                lambda: plan(robot, thing, None, obstacles, predictor, at_edge, seed, grasps, start, place)]
+    elif height_of(points, table.height) > UNLIKELY and width_of(points) < WIDEST:
+        ways.insert(0, trusted_alone)
+    faults = list[str]()
+    for way in ways:
+        try:
+            return way()
+        except (PlanError, NoGraspError) as error:
+            faults.append(str(error))
+    raise PlanError("; ".join(dict.fromkeys(faults)))
+
+
+def _trusted(
+    robot: Robot, obj: ObjectModel, obstacles: Sequence[ObjectModel], predictor: GraspPredictor | None, config: PlanConfig,
+    seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None, place: Sequence[float] | str | Place | None,
+    grasps: GraspBatch | None = None,
+) -> MotionPlan:
+    """The motion to a grasp, of these or of the first predicted batch, that holds in most of its rehearsals.
+
+    Raises:
+        PlanError: There is none.
+    """
+    wanted = place if place is None or isinstance(place, Place) else Place.of(place)
+    task, tries = Task.of(robot, obj, np.eye(4), obstacles, config, seed, start, wanted), Tries()
+    task.check_start()
+    batch, _ = next(candidates(task, tries, grasps, predictor))
+    add(task, tries, batch)
+    goals = rehearsed(task, tries, reachable(task, tries))
+    made = motion(task, tries, goals, seed) if goals and trusted(task, tries, goals[0].index) else None
+    if made is None:
+        raise PlanError(f"no grasp of '{obj.name}' is trusted: {grasps_and_dropped(len(tries.grasps), tries.counts)}")
+    return made
