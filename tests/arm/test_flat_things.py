@@ -24,6 +24,8 @@ from dro_grasp.arm.tabletop import TabletopConfig, _follow, attempt, carry_out
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import load_scene
 
 TABLE = Table(0.02, (0.45, 0.0), (1.2, 0.6))
 EYE = np.array([0.95, 0.0, 0.8])
