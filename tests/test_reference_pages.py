@@ -19,6 +19,7 @@ from dro_grasp.grasps.columns import (
     FRAME,
     FURTHER,
     HAND_FILE,
+    OBJECT_CLOUD,
     OBJECT_FILE,
     OBJECT_MASS,
     OBJECT_SCALE,
@@ -193,7 +194,7 @@ def stated_names(page: str) -> set[str]:
 
 def test_the_page_of_formats_has_every_column() -> None:
     stated = stated_names("file-formats.md")
-    grasps = {*COLUMNS, "wrist_position", "wrist_quaternion_wxyz", "success", *FURTHER, *NAMES, HAND_FILE, OBJECT_FILE,
-              OBJECT_SCALE, OBJECT_MASS, FRAME, CAMERA, DEPTH, RELABELLED}
+    grasps = {*COLUMNS, "wrist_position", "wrist_quaternion_wxyz", "success", *FURTHER, *NAMES, HAND_FILE, OBJECT_CLOUD,
+              OBJECT_FILE, OBJECT_SCALE, OBJECT_MASS, FRAME, CAMERA, DEPTH, RELABELLED}
     assert grasps - {"T_object_wrist", "trial_success"} <= stated
     assert {f.name for f in fields(Attempt)} <= stated

@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from dro_grasp.cli.main import main
+from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import load_grasps
-from dro_grasp.grasps.sources import frame_of
+from dro_grasp.grasps.sources import frame_of, object_of
 from tests.helpers.made_scenes import MadeScene, make_scene
 
 
@@ -40,6 +41,16 @@ def test_grasps_lie_at_the_thing_that_is_meant(common: list[str], made: MadeScen
     grasps = load_grasps(tmp_path / "g.parquet")
     assert frame_of(grasps) == "base"
     assert (np.linalg.norm(grasps.wrist_position.numpy() - made.middles[1], axis=1) < 0.35).all()
+    obj = object_of(grasps, None, 1.0)
+    assert {obj.sha256} == set(grasps.object_sha256)
+    assert obj.seen is not None
+    assert obj.table is not None
+    np.testing.assert_allclose(np.linalg.norm(obj.cloud_normals, axis=1), 1, atol=1e-3)
+    assert (np.linalg.norm((obj.cloud.min(0) + obj.cloud.max(0)) / 2 - made.middles[1])) < 0.03
+    assert main(["export", str(tmp_path / "g.parquet"), "--format", "csv", "--output", str(tmp_path / "g.csv")]) == 0
+    damaged = grasps.replace(extra=grasps.extra | {"object_cloud": ("AAAA",) * len(grasps)})
+    with pytest.raises(ObjectError, match="in the grasp file is damaged"):
+        object_of(damaged, None, 1.0)
     with Image.open(tmp_path / "s.png") as picture:
         assert picture.size[0] > 1000
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.geometry.table_plane import THICKNESS, above_plane, largest_plane, moved_plane, table_plane
+from dro_grasp.geometry.table_plane import LEAST_THICK, above_plane, largest_plane, moved_plane, table_plane
 from dro_grasp.objects.catalogue import load_object
 
 
@@ -29,9 +29,23 @@ def test_a_table_is_found_in_any_pose(name: str) -> None:
     foot = R @ [0, 0, load_object(name).cloud[:, 2].min()] + t
     assert abs(foot @ plane[:3] - plane[3]) < 0.003  # [m]
     kept = above_plane(points @ R.T + t, plane)
-    higher = points[:own, 2] > points[:own, 2].min() + 3 * THICKNESS
+    higher = points[:own, 2] > points[:own, 2].min() + 6 * LEAST_THICK
     assert kept[:own][higher].all()
     assert kept[own:].mean() < 0.001
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.006])
+def test_as_much_is_cut_as_the_points_scatter(noise: float) -> None:
+    points, own = on_table("cube", 0.6, noise)
+    plane = table_plane(points)
+    assert plane is not None
+    assert abs(plane[3] - load_object("cube").cloud[:, 2].min()) < 0.002
+    kept = above_plane(points, plane)
+    assert kept[own:].mean() < 0.004, "all but what is beyond three deviations"
+    higher = points[:own, 2] - plane[3] > max(LEAST_THICK, 4 * noise)
+    assert kept[:own][higher].all()
+    if noise == 0:
+        assert kept[:own].mean() > 0.77, "little but its foot, a sixth, is lost"
 
 
 def test_points_stay_on_a_plane_that_is_moved_with_them() -> None:

@@ -252,8 +252,8 @@ class Generate:
         if not len(kept):
             self.say_that_none_is_left(obj.name, output, picture)
         if output is not None:
-            # Of a scene's file alone the object cannot be loaded again.
-            with_sources(kept, self.hand, name if job.found is None else "", self.scale, job.camera).save(output)
+            taken = None if job.found is None else obj  # of a scene's file alone it cannot be loaded again
+            with_sources(kept, self.hand, name, self.scale, job.camera, taken).save(output)
         if picture is not None and len(kept):
             from dro_grasp.pictures.sheets import draw_grasps
 

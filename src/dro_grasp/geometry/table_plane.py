@@ -10,8 +10,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dro_grasp.geometry.point_groups import separate_groups
 
-THICKNESS = 0.006
-"""Points nearer than this to the plane belong to it [m] (ours): about three standard deviations of a depth camera's noise."""
+NEAR = 0.006  # Points at most this far from a plane are counted for it [m] (ours)
+WINDOW = 0.02  # Points at most this far from a plane tell how far its points scatter [m] (ours)
+LEAST_THICK = 0.003  # Half thickness of a plane without noise [m] (ours): clouds are given to a millimetre
+MOST_THICK = 0.02  # Largest half thickness of a plane [m] (ours); between, three standard deviations of what was seen
 BELOW = 0.02  # Largest share of the points that may lie below a wide table; below a small one, of those above (ours)
 WIDE = 0.08  # Area from which a plane is no wing or lid of an object of which parts stand on it [m^2] (ours)
 LEAST_REST = 16  # Fewest points above a table (ours)
@@ -23,29 +25,52 @@ def table_plane(
     """Upward normal and height [m] of the table in a cloud [m], which the camera sees from above; None if there is none."""
     if len(points) < 2 * LEAST_REST or not np.abs(points).max() < 100.0:
         return None  # farther [m], it is in another unit (ours)
-    plane = largest_plane(points, THICKNESS)
+    plane = largest_plane(points, NEAR)
     if plane is None:
         return None
     height = points @ plane[:3] - plane[3]
-    if camera is not None and camera @ plane[:3] < plane[3]:
-        plane, height = -plane, -height
-    elif camera is None and (height > THICKNESS).sum() < (height < -THICKNESS).sum():
-        plane, height = -plane, -height
-    on, above, below = np.abs(height) <= THICKNESS, height > THICKNESS, height < -THICKNESS
+    # Curved sides of things scatter as noise does: only a wide table may be thicker than NEAR.
+    for thick in sorted({NEAR, max(NEAR, thickness(height))}):
+        side = 1.0 if camera is None else math.copysign(1.0, float(camera @ plane[:3] - plane[3]))
+        if camera is None and (height > thick).sum() < (height < -thick).sum():
+            side = -1.0
+        if _is_table(points, side * plane, side * height, thick, WIDE if thick > NEAR else 0.0):
+            return side * plane
+    return None
+
+
+def _is_table(
+    points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"], height: Float[np.ndarray, " n"], thick: float,
+    least: float,
+) -> bool:
+    """Whether a plane of at least this area [m^2] is a table, and everything else is above it."""
+    on, above, below = np.abs(height) <= thick, height > thick, height < -thick
     # The shares and the area are ours. A table is twice as large as what stands on it: an object's flat face is none.
     if on.mean() < 0.3 or above.sum() < LEAST_REST or below.mean() > BELOW:
-        return None
+        return False
     area, standing = _area(points[on], plane), _area(points[above], plane)
     if area > WIDE:  # several things, or scattered points, may stand all over it
         standing = sum(_area(points[above][own], plane) for own in separate_groups(points[above]))
     elif below.sum() > BELOW * above.sum():
-        return None
-    return plane if area > 2.0 * standing else None
+        return False
+    return area > max(least, 2.0 * standing)
 
 
 def above_plane(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> Bool[np.ndarray, " n"]:
-    """Points above the plane by more than its thickness."""
-    return points @ plane[:3] - plane[3] > THICKNESS
+    """Points above the plane by more than it is thick."""
+    height = points @ plane[:3] - plane[3]
+    return np.asarray(height > thickness(height))
+
+
+def scatter(height: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of the heights of a plane's points [m], by the median of those near it; 0 for none."""
+    near = np.abs(height[np.abs(height) < WINDOW])
+    return 1.4826 * float(np.median(near)) if len(near) else 0.0
+
+
+def thickness(height: Float[np.ndarray, " n"]) -> float:
+    """Half thickness of a plane whose points have such heights among others [m]: three standard deviations."""
+    return float(np.clip(3 * scatter(height), LEAST_THICK, MOST_THICK))
 
 
 def moved_plane(plane: Float[np.ndarray, "4"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:

@@ -42,6 +42,8 @@ RELABELLED = "relabelled"  # Further column of stored grasps: whether idle finge
 HAND_FILE = "hand_file"  # Further column: path of the hand's description, if the hand is a user's own
 OBJECT_FILE = "object_file"  # Further column: path of the object, if it is a user's own
 OBJECT_SCALE = "object_scale"  # Further column: scale of that file
+OBJECT_CLOUD = "object_cloud"
+"""Further column: the object, if it is a cloud that is in no file, as taken out of a scene; NPZ in base64."""
 OBJECT_MASS = "object_mass"  # Further column: mass that was stated of the object [kg]; NaN for none
 FRAME = "frame"  # Further column of grasps on a camera's cloud: name of the frame of the poses
 CAMERA = "T_frame_camera"  # Further column of such grasps: pose of the camera in that frame, row by row [m]

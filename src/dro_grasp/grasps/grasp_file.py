@@ -21,7 +21,7 @@ from dro_grasp.files import given_path, reading
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps import columns
-from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_CLOUD, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
 
 HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a name"}  # Texts of the header
 JOINTS = "joint_names"  # Entry of the header with the names of the joints
@@ -48,7 +48,8 @@ def _is_list_of(test: Callable[[pa.DataType], bool]) -> Callable[[pa.DataType], 
 
 
 KINDS: tuple[tuple[str, Callable[[pa.DataType], bool], tuple[str, ...]], ...] = (
-    ("texts", _is_text, (*columns.TEXTS, "protocol", columns.REASON, columns.FAILURE, HAND_FILE, OBJECT_FILE, FRAME)),
+    ("texts", _is_text,
+     (*columns.TEXTS, "protocol", columns.REASON, columns.FAILURE, HAND_FILE, OBJECT_CLOUD, OBJECT_FILE, FRAME)),
     ("numbers", _is_number, (*columns.FLOATS, OBJECT_SCALE, OBJECT_MASS)),
     ("whole numbers", pa.types.is_integer, ("seed",)),
     ("truth values", pa.types.is_boolean, ("success",)),

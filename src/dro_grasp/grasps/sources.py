@@ -11,7 +11,8 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
-from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_CLOUD, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
+from dro_grasp.grasps.recorded_cloud import packed_cloud, unpacked_cloud
 
 if TYPE_CHECKING:
     from dro_grasp.frames import NamedMotion
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
     from dro_grasp.objects.shape import ObjectModel
 
 
-def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None) -> GraspBatch:
+def with_sources(
+    grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None, taken: ObjectModel | None = None
+) -> GraspBatch:
     """Grasps of one object that record the files of their hand and object, unless their names are built-in.
 
-    `camera` is the pose of the camera that saw the object, in the frame of the grasps.
+    `camera` is the pose of the camera that saw the object, in the frame of the grasps; `taken` a cloud that is in no file.
     """
     file = given_path(obj)
-    return recorded(grasps, hand_file(hand), str(file.resolve()) if file.is_file() else None, scale, camera)
+    known = taken is None and file.is_file()
+    return recorded(grasps, hand_file(hand), str(file.resolve()) if known else None, scale, camera, taken)
 
 
 def hand_file(hand: str) -> str | None:
@@ -40,9 +44,10 @@ def hand_file(hand: str) -> str | None:
 
 
 def recorded(
-    grasps: GraspBatch, hand: str | None, obj: str | None, scale: float, camera: NamedMotion | None = None
+    grasps: GraspBatch, hand: str | None, obj: str | None, scale: float, camera: NamedMotion | None = None,
+    taken: ObjectModel | None = None,
 ) -> GraspBatch:
-    """Grasps of one object that record the files of their hand and object, as far as these have any, and the camera."""
+    """Grasps of one object that record the files of their hand and object, or the cloud that was taken, and the camera."""
     import torch
 
     n, extra = len(grasps), dict(grasps.extra)
@@ -51,6 +56,9 @@ def recorded(
     if obj is not None:
         extra[OBJECT_FILE] = (obj,) * n
         extra[OBJECT_SCALE] = torch.full((n,), scale)
+        extra.pop(OBJECT_CLOUD, None)  # the file has it
+    if taken is not None:
+        extra[OBJECT_CLOUD] = (packed_cloud(taken),) * n
     if camera is not None:
         extra[FRAME] = (camera.frame,) * n
         extra[CAMERA] = camera.T.reshape(1, 16).expand(n, 16)
@@ -64,7 +72,9 @@ def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBat
     read = hand.description
     own = read is not None and hand.name == read.name and read.path.parent != BUILTIN_FOLDER
     grasps = with_mass_of(grasps, obj)
-    return with_sources(grasps, read.source if read is not None and own else hand.name, obj.file or obj.name, obj.scale)
+    taken = obj if obj.is_cloud and obj.file is None else None
+    return with_sources(
+        grasps, read.source if read is not None and own else hand.name, obj.file or obj.name, obj.scale, taken=taken)
 
 
 def with_mass_of(grasps: GraspBatch, obj: ObjectModel) -> GraspBatch:
@@ -126,6 +136,8 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMod
 
     if given is not None:
         return load_object(given, scale=scale)
+    if (taken := _recorded(grasps, OBJECT_CLOUD)) is not None:
+        return unpacked_cloud(taken, grasps.object[0])
     try:
         source, own_scale = object_source(grasps, scale)
         pose = camera_pose(grasps)

@@ -197,6 +197,12 @@ def test_a_scene_given_as_an_object_is_told_apart() -> None:
     assert load_object(room, keep_table=True).is_cloud
 
 
+def test_a_bare_table_is_no_object() -> None:
+    with pytest.raises(ObjectError, match=r"a plane of 0\.\d\d m² and nothing on it"):
+        load_object(_table())
+    assert load_object(_table(), keep_table=True).is_cloud
+
+
 def test_a_thing_alone_is_an_object() -> None:
     long = trimesh.creation.box((0.9, 0.05, 0.05))
     assert load_object(np.asarray(trimesh.sample.sample_surface(long, 3000, seed=0)[0])).is_cloud

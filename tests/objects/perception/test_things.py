@@ -44,7 +44,7 @@ def test_several_things_on_a_table_are_asked_about_with_their_places(count: int,
         read(view(count))
     told = str(caught.value).partition("(")[2].partition(")")[0].split("; ")
     assert len(told) == count
-    assert told[0].startswith("6 x 6 x 5 cm about -0.15 0.0")  # its lowest points went with the table
+    assert told[0].startswith("6 x 6 x 6 cm about -0.15 0.0")
 
 
 @pytest.mark.parametrize("camera", [False, True])

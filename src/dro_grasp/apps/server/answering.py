@@ -142,7 +142,9 @@ class Answerer:
         odd = [doubt(problem.constraints, obj, call.camera is not None), made.shortage]
         kept = grasps[grasps.success] if call.only_successful else grasps
         camera = None if call.camera is None else NamedMotion(call.camera.frame, sent_pose(call.camera).float())
-        file = recorded(kept, self.hand_files.get(hand.name), call.path, call.object.scale, camera).to_bytes()
+        taken = None if call.choose is None else obj
+        file = recorded(
+            kept, self.hand_files.get(hand.name), None if taken else call.path, call.object.scale, camera, taken).to_bytes()
         text = base64.b64encode(file).decode()
         return GenerateAnswer(
             **told._asdict(), file=text, kept=len(kept), seconds={"load": loaded, **made.seconds, "trial": trial},

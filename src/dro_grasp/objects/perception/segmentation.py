@@ -11,15 +11,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from dro_grasp.geometry.table_plane import largest_plane
+from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
 
 CELL = 0.004  # Edge of the cubes whose points are averaged [m] (ours): noise of single pixels goes, a finger's width stays
+NOISES = 2.0  # Standard deviations of the noise that a cube measures at least [1] (ours)
+MOST_EDGE = 0.008  # Largest edge for their sake [m] (ours)
 MOST_CELLS = 45_000  # Filled cubes above which they grow (ours): what two cores take apart in 2 s
 REACH = 1.5  # Points nearer to the camera than this count [m], and those up to twice the distance of the nearest (ours)
 NEIGHBOURS = 24  # Neighbours that estimate a normal (ours): about 12 mm around
 NEAR = 0.008  # Points at most this far from a plane are counted for it [m] (ours)
-LEAST_THICK = 0.006  # Least half thickness of a plane [m] (ours): three standard deviations of 2 mm
-MOST_THICK = 0.016  # Largest half thickness of a plane [m] (ours); between, three standard deviations of what was seen
 TILTED = 0.7  # Least cosine between a plane's normal and those of its points [1] (ours)
 MOST_PLANES = 12  # Planes that are tried (ours): a shelf has eight
 PATCH = 0.02  # Edge of the squares in which a plane's area is counted [m] (ours)
@@ -30,6 +30,7 @@ SPANS = 0.5  # Share of the largest plane's length that a smaller one beside it 
 LEAST_WALL = 0.25  # Shortest diagonal of a wall [m] (ours)
 LEAST_BOARD = 0.4  # Shortest diagonal of a board along the largest plane [m] (ours)
 LEAST_BOARD_AREA = 0.03  # Least area of a board along the largest plane [m^2] (ours)
+WALL_THICK = 0.016  # Half thickness of such a wall [m] (ours)
 LONGEST_FACE = 0.35  # Longest thing that is all one plane: what is longer is a wall seen from outside [m] (ours)
 FLOATS = 0.04  # Height above all planes from which a thing floats, so that it is a part of one below it [m] (ours)
 GAP = 0.06  # Largest gap between these [m] (ours)
@@ -37,7 +38,7 @@ UNDER = 0.01  # Distance aside up to which one is below the other [m] (ours)
 BACK = 0.03  # Points so far behind a plane are the edges of its board [m] (ours)
 LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
 CORE = 5  # Neighbours of a cube that joins others (ours): single points between two things, as cameras make, join none
-LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetres
+LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetres, 15 under strong noise
 LEAST_SPECK = 5  # Filled cubes of what hands avoid, at least (ours)
 LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours)
 FRAGMENT = 0.015  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
@@ -76,6 +77,9 @@ def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
     by Stein et al. 2014.
     """
     view = _View.of(points, camera)
+    edge = _edge(view, points)
+    if edge > view.edge:
+        view = _View.of(points, camera, edge)
     planes = _planes(view)
     owned = np.full(len(view.cells), NOTHING)
     for plane in planes:
@@ -97,13 +101,15 @@ class _View:
     cell_of: Int[np.ndarray, " n"]  # cube of each point; -1 for points too far away
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> _View:
+    def of(
+        cls, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None, edge: float = CELL
+    ) -> _View:
         kept: Bool[np.ndarray, " n"] = np.ones(len(points), bool)
         cell_of = np.full(len(points), -1)
         if camera is not None and len(points):
             away = np.linalg.norm(points - camera, axis=1)
             kept = away < max(REACH, 2 * float(np.quantile(away, 0.02)))
-        cells, own, edge = _averaged(points[kept])
+        cells, own, edge = _averaged(points[kept], edge)
         cell_of[kept] = own
         normals = _normals(cells)
         if camera is not None:
@@ -111,9 +117,18 @@ class _View:
         return cls(cells, normals, edge, camera, cell_of)
 
 
-def _averaged(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " n"], float]:
+def _edge(view: _View, points: Float[np.ndarray, "n 3"]) -> float:
+    """Edge of cubes in which noise averages out, as the points near the largest plane scatter [m]."""
+    fit = largest_plane(view.cells, NEAR, fits=3)
+    if fit is None:
+        return CELL
+    facing = (np.abs(view.normals @ fit[:3]) > TILTED)[view.cell_of] & (view.cell_of >= 0)
+    return min(NOISES * scatter((points @ fit[:3] - fit[3])[facing]), MOST_EDGE)
+
+
+def _averaged(points: Float[np.ndarray, "n 3"], edge: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " n"], float]:
     """Means of the points in each filled cube [m], the cube of each point, and the cubes' edge [m]."""
-    edge, low = CELL, points.min(0)
+    low = points.min(0)
     while True:
         index = np.floor((points - low) / edge).astype(np.int64)
         sides = index.max(0) + 1
@@ -194,9 +209,7 @@ def _planes(view: _View) -> list[_Plane]:
 def _seen_plane(view: _View, pool: Int[np.ndarray, " p"], fit: Float[np.ndarray, "4"]) -> _Plane:
     height = view.cells[pool] @ fit[:3] - fit[3]
     facing = np.abs(view.normals[pool] @ fit[:3]) > TILTED
-    close = np.abs(height) < 2.5 * NEAR
-    spread = 1.4826 * float(np.median(np.abs(height[close & facing]))) if (close & facing).any() else 0.0
-    thick = float(np.clip(3 * spread, LEAST_THICK, MOST_THICK))
+    thick = thickness(height[facing])
     own = pool[(np.abs(height) <= thick) & facing]
     axes = np.linalg.svd(fit[None, :3])[2][1:]
     along = view.cells[own] @ axes.T
@@ -282,7 +295,7 @@ def _is_other(cells: Float[np.ndarray, "k 3"], levels: list[Float[np.ndarray, "4
     if longest <= (LEAST_WALL if over and min(over) > FLOATS else LONGEST_FACE):
         return False
     fit = largest_plane(cells, NEAR)
-    return fit is not None and float((np.abs(_over(cells, fit)) < MOST_THICK).mean()) > 0.85
+    return fit is not None and float((np.abs(_over(cells, fit)) < WALL_THICK).mean()) > 0.85
 
 
 def _over(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:

@@ -7,9 +7,10 @@ from jaxtyping import Float, Int
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_groups import separate_groups
-from dro_grasp.objects.perception.segmentation import CERTAIN_AREA, segment
+from dro_grasp.objects.perception.segmentation import CERTAIN_AREA, STRUCTURE, segment
 
 MOST_TOLD = 6  # Things that a message lists (ours)
+BARE = 0.25  # Area from which a plane alone is a table without a thing on it [m^2] (ours)
 LIKELY = 0.5  # Extent up to which a cloud is taken for an object without asking [m] (ours)
 AS_SCENE = ("give it as a scene, of which one thing is meant (scene=FILE camera=JSON, and nearest=True, at=(X, Y, Z) or "
             "pixel=(U, V); load_scene and object_at in Python)")  # What to do with a scene
@@ -45,6 +46,9 @@ def refuse_scene(points: Float[np.ndarray, "n 3"], kept: Float[np.ndarray, "m 3"
     if not len(kept) or np.ptp(kept, axis=0).max() <= LIKELY:
         return
     shown = segment(points)
+    if not shown.count and len(shown.areas) == 1 and shown.areas[0] > BARE and (shown.labels == STRUCTURE).mean() > 0.95:
+        raise ObjectError(f"{origin} shows a plane of {shown.areas[0]:.2f} m² and nothing on it, as of a bare table; look at "
+                          "the object, or keep all points as one object with keep_table=True")
     if not shown.count or max(shown.areas, default=0.0) < CERTAIN_AREA:
         return
     things = "1 thing" if shown.count == 1 else f"{shown.count} things"
