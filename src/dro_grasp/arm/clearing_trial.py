@@ -15,6 +15,7 @@ from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.tabletop import Region, TabletopConfig, Watcher, depth_image, scatter, thinned_intrinsics
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError
+from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.scan import depth_points
@@ -67,7 +68,10 @@ class SimulatedRig:
         assert camera is not None
         self._looks += 1
         depth, _ = depth_image(self.scene, camera, self._noise, self._seed + self._looks)
-        return depth_points(depth, thinned_intrinsics(camera))
+        points = depth_points(depth, thinned_intrinsics(camera))
+        if self._watch is not None:
+            self._watch.looked(points)
+        return points
 
     def move(self, arm: Trajectory, hand: Trajectory) -> None:
         """As of `Rig`."""
@@ -104,8 +108,13 @@ def clear_trial(
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
     rig = SimulatedRig(scene, config.noise, seed + 1000 * number, watch)
     judgements = list[tuple[str, bool]]()
-    cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, progress,
-                    lambda check: judgements.append((check.state, rig.holds())))
+
+    def judged(check: HoldCheck) -> None:
+        judgements.append((check.state, rig.holds()))
+        if watch is not None:
+            watch.judged(check, judgements[-1][1])
+
+    cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, progress, judged)
     scene.advance(1.0)
     centres = [(T[:3, :3] @ obj.centre_of_mass + T[:3, 3])[None] for i, obj in enumerate(objects) for T in [scene.pose(i)]]
     fallen = tuple(bool(centre[0, 2] < table.height - LOW) for centre in centres)

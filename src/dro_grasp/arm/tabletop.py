@@ -38,6 +38,7 @@ from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder, reading, replacing
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.builtin.usual import OBJECTS
@@ -206,6 +207,12 @@ class Watcher:
 
     def moved(self, scene: LiftScene) -> None:
         """Time has passed; called at least fifty times a second of simulated time."""
+
+    def looked(self, points: Float[np.ndarray, "n 3"]) -> None:
+        """A camera has seen these points, in its frame [m]; only told where a table is cleared, as the next one."""
+
+    def judged(self, check: HoldCheck, held: bool | None = None) -> None:
+        """The joints were asked whether the hand holds something; whether it really does, where that is known."""
 
 
 def attempt(

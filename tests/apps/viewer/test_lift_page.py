@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.apps.viewer.lift_page import EVERY, Film, LiftPage, lift_page
+from dro_grasp.apps.viewer.film import Film
+from dro_grasp.apps.viewer.lift_page import EVERY, LiftPage, lift_page
 from dro_grasp.arm.animation import Recorder
 from dro_grasp.arm.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.robot_check import robot_shapes, shape_poses
@@ -46,8 +47,8 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
         last = len(page.film.arm) - 1
         page.show_moment(last)
         expected = shape_poses(robot, plan.arm.position[-1], plan.hand.position[-1])
-        assert len(page._links) == len(robot_shapes(robot))
-        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert len(page.arm_view.links) == len(robot_shapes(robot))
+        assert np.allclose([handle.position for handle in page.arm_view.links], expected[:, :3, 3], atol=1e-6)
         motion = robot.T_world_wrist(plan.arm.position[-1]) @ np.linalg.inv(robot.T_world_wrist(robot.home))
         assert np.allclose(page._clouds[0].position, motion[:3, 3], atol=1e-6)
         assert np.linalg.norm(motion[:3, 3]) > 0.05
@@ -83,9 +84,9 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
         page.repeat(1)
         assert ran == [(robot.name, 0, dro.load_weights(own).name), (other.name, 1, DEFAULT)]
         assert page.name.content == f"**{other.name}**"
-        assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
+        assert len(page.arm_view.links) == len(robot_shapes(other)) != len(robot_shapes(robot))
         expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
-        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert np.allclose([handle.position for handle in page.arm_view.links], expected[:, :3, 3], atol=1e-6)
         assert "Not as stored**: with other content than then: object. held" in page.text.content
     finally:
         page.stop()
