@@ -36,6 +36,8 @@ PLACE_COLOUR: Colour = (0.30, 0.65, 0.42)  # Green of where the thing will stand
 NEAR = 0.15  # Margin of the thing in the view of its grasps [m] (ours)
 LEVEL = 0.98  # Least cosine to the vertical of the plane that is the robot's table [1] (ours)
 TABLE_WITHIN = 0.05  # Farthest that the plane below a thing may be from the robot's table to be it [m] (ours)
+SEEDS = 4  # How often the motion of one grasp is tried (ours)
+FLOATS = 0.1  # Greatest height of a cloud's lowest point above what it stands on [m] (ours)
 ON_PLANE = 0.02  # Points nearer to a plane than this are its own [m] (ours)
 
 
@@ -179,7 +181,7 @@ class RobotScenePage(ScenePage):
         return Offer(wish, found, grasps[order], tuple(faults[i] for i in order), shortage)
 
     def _task(self, wish: Wish, found: FoundObject, spot: tuple[float, ...] | None) -> Task:
-        place = None if spot is None else Place.of(spot)
+        place = None if spot is None else place_of_cloud(spot, found.obj)
         return Task.of(levelled(self.robot, found.obj), found.obj, np.eye(4), (), self._config(wish, found), wish.seed,
                        place=place)
 
@@ -205,17 +207,8 @@ class RobotScenePage(ScenePage):
             return
         self._forget_film()
         self._say("The motion is planned ..." if spot is None else "The motion to the place is planned ...")
-        task = self._task(offer.wish, offer.found, None)
-        batches = iter([offer.grasps[[index]] if chosen else offer.grasps])
-        further = predicted(task, self.predictor)
-
-        def batch(seed: int) -> GraspBatch:
-            self._still(offer.wish)
-            return next(batches, None) or further(seed)
-
         try:
-            made = plan(task.robot, offer.found.obj, predictor=self.predictor, config=task.config, seed=offer.wish.seed,
-                        grasps=offer.grasps[[index]] if chosen else batch, place=spot)
+            made = self._planned_one(offer, index, spot) if chosen else self._planned_any(offer, spot)
         except Superseded:
             return
         except PlanError as error:
@@ -223,6 +216,31 @@ class RobotScenePage(ScenePage):
         if self.offer is offer:  # nothing else was clicked meanwhile
             own = made.notes.chosen
             self._project(made, index if chosen else own if own < len(offer.grasps) else None)
+
+    def _planned_one(self, offer: Offer, index: int, spot: tuple[float, ...] | None) -> MotionPlan:
+        """The motion of one grasp; postures of the arm are drawn, so several seeds are tried."""
+        task = self._task(offer.wish, offer.found, spot)
+        for left in reversed(range(SEEDS)):
+            self._still(offer.wish)
+            try:
+                return plan(task.robot, offer.found.obj, predictor=self.predictor, config=task.config,
+                            seed=offer.wish.seed + left, grasps=offer.grasps[[index]], place=task.place)
+            except PlanError:
+                if not left:
+                    raise
+        raise AssertionError("the last of several tries returns or raises")
+
+    def _planned_any(self, offer: Offer, spot: tuple[float, ...] | None) -> MotionPlan:
+        """The motion of the best grasp that works, of those in the list and of further ones."""
+        task, batches = self._task(offer.wish, offer.found, spot), iter([offer.grasps])
+        further = predicted(task, self.predictor)
+
+        def batch(seed: int) -> GraspBatch:
+            self._still(offer.wish)
+            return next(batches, None) or further(seed)
+
+        return plan(task.robot, offer.found.obj, predictor=self.predictor, config=task.config, seed=offer.wish.seed,
+                    grasps=batch, place=task.place)
 
     def _project(self, made: MotionPlan, index: int | None) -> None:
         """Put the film of a plan on the page, of a grasp in the list or of another one."""
@@ -287,6 +305,18 @@ def levelled(robot: Robot, obj: ObjectModel) -> Robot:
     if robot.table is None or height is None or abs(height - robot.table.height) > TABLE_WITHIN:
         return robot
     return replace(robot, table=replace(robot.table, height=height))
+
+
+def place_of_cloud(spot: tuple[float, ...], obj: ObjectModel) -> Place:
+    """A place on a surface [m], where a cloud is let go as high above it as its lowest point is above what it stands on now.
+
+    Of what a camera sees from above, the underside is often missing: put down with that point on the surface, it would be
+    pressed into it.
+    """
+    x, y, z, *turn = spot
+    height = height_below(obj)
+    gap = 0.0 if height is None else min(max(0.0, float(obj.cloud[:, 2].min()) - height), FLOATS)
+    return Place((x, y, z + gap), turn[0] if turn else None, falls=gap)
 
 
 def height_below(obj: ObjectModel) -> float | None:
