@@ -23,7 +23,7 @@ KIND = "cleared table"  # Entry `kind` of their header
 WANTED = "a record of a cleared table (.npz), as `dro-grasp clear --record` writes it"  # What a reader expects
 RATE = 10.0  # Moments that are kept for each second (ours)
 
-Shape = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]  # Vertices [m] and triangles
+Shape = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]  # Vertices [m] and triangles
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,30 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
         assert "3 grasps: 1 out of reach" in page.text.content
     finally:
         page.stop()
+
+
+def test_played_lifts_say_what_the_joints_say_of_the_hand(robot: dro.Robot, plan: dro.MotionPlan) -> None:
+    """Held where the fingers are where the object stops them, empty where they went on; nothing before the lift."""
+    n = len(robot.hand_joints)
+    squeezed, empty = np.full(n, 0.5), np.full(n, 0.9)
+    hold = {"held_joints": squeezed, "held_torque": np.zeros(n), "empty_joints": empty, "empty_torque": np.zeros(n),
+            "hold_unit": np.ones(n)}
+    told = replace(plan, notes=replace(plan.notes, hold={name: tuple(row.tolist()) for name, row in hold.items()}))
+    recorder = Recorder(10.0, plan=told)
+    for joints in (squeezed, empty):
+        recorder.frames += [(robot.home, joints, np.eye(4)[None])] * 15  # of 2 s, of which the last 0.4 s are the lift
+    film = Film.of_attempt(recorder)
+    assert film.held[:15] == (None,) * 15
+    recorder.frames = recorder.frames[::-1]
+    late = Film.of_attempt(recorder)
+    for made, state in ((film, "empty"), (late, "held")):
+        last = made.held[-1]
+        assert last is not None
+        assert last[0] == state
+        assert f"the hand is **{state}**" in made.words[-1]
+    assert film.words[0].startswith("**reach**")
+    assert film.words[-1].startswith("**after the lift**")
+    assert Film.of_plan(robot, plan).held == ()
 
 
 def test_each_attempt_is_played_with_its_own_robot_and_weights(

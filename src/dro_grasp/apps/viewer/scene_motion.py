@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dro_grasp.apps.viewer.film import RATE, Film
 from dro_grasp.apps.viewer.robot_view import RobotView
 from dro_grasp.apps.viewer.scene_cloud import POINT, shades
-from dro_grasp.apps.viewer.scene_page import STRUCTURE_THERE, Offer, ScenePage, Superseded, Wish
+from dro_grasp.apps.viewer.scene_page import STRUCTURE_THERE, Offer, ScenePage, Wish
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
 from dro_grasp.arm.animation import VIEW
 from dro_grasp.arm.motion import MotionPlan
@@ -151,9 +151,15 @@ class RobotScenePage(ScenePage):
         x, y, z, *turn = spot
         points = offer.found.obj.cloud.astype(np.float64)
         c, s = math.cos(turn[0] if turn else 0.0), math.sin(turn[0] if turn else 0.0)
-        points = (points - foot(points)) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + (x, y, z)
-        normals = offer.found.obj.cloud_normals.astype(np.float64)
-        shade = shades(normals, np.asarray(self.cloud.up))[:, None]
+        T = np.eye(4)
+        T[:3, :3] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        T[:3, 3] = np.array([x, y, z]) - T[:3, :3] @ foot(points)
+        self._draw_there(offer, T)
+
+    def _draw_there(self, offer: Offer, T: Float[np.ndarray, "4 4"]) -> None:
+        """Show the thing at the end of a motion of it [m]."""
+        points, normals = (a.astype(np.float64) @ T[:3, :3].T for a in (offer.found.obj.cloud, offer.found.obj.cloud_normals))
+        points, shade = points + T[:3, 3], shades(normals, np.asarray(self.cloud.up))[:, None]
         self.client.scene.add_point_cloud(
             "/place", points.astype(np.float32), (np.array(rgb(PLACE_COLOUR)) * shade).astype(np.uint8), point_size=POINT,
             point_shape="circle", precision="float32")
@@ -209,8 +215,6 @@ class RobotScenePage(ScenePage):
         self._say("The motion is planned ..." if spot is None else "The motion to the place is planned ...")
         try:
             made = self._planned_one(offer, index, spot) if chosen else self._planned_any(offer, spot)
-        except Superseded:
-            return
         except PlanError as error:
             raise PlanError(f"{error}. On this page: choose another grasp or place, or press '{self.any.label}'") from error
         if self.offer is offer:  # nothing else was clicked meanwhile
@@ -248,6 +252,8 @@ class RobotScenePage(ScenePage):
             self.grasp.value = self.grasp.options[index]
             self._show()
         self.made, self.film = made, Film.of_plan(self.robot, made)
+        if self.offer is not None and made.notes.place is not None:  # it may have been turned
+            self._draw_there(self.offer, np.array(made.notes.place))
         self.hand_view.hide()
         self.marks.hide()
         self.moment.max, self.moment.value = len(self.film.arm) - 1, 0

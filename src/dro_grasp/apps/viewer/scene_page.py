@@ -249,6 +249,8 @@ class ScenePage(Page):
         def both() -> None:
             try:
                 work()
+            except Superseded:
+                pass
             except DroGraspError:
                 if self._wish is None or self._wish is self._answered:
                     raise
