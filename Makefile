@@ -77,6 +77,7 @@ docs-pictures: setup
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
 	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png
 	$(BIN)/python -m scripts.draw_studio docs/pictures/studio.png
+	$(BIN)/python -m scripts.draw_scene_page docs/pictures/scene-page.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
 FULLER_HANDS := assets/allegro_left assets/shadowhand

@@ -32,6 +32,10 @@ SIZE = (480, 360)  # Width and height [pixels]
 VIEW = (0.9, -1.25, 0.75)  # Direction from the robot towards the camera, in the world
 FIXTURE_COLOUR: Colour = (0.55, 0.60, 0.68)  # Grey blue of what does not move
 OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)  # Green of other objects on the table
+THING_COLOURS: tuple[Colour, ...] = (
+    OBJECT_COLOUR, (0.36, 0.60, 0.47), (0.80, 0.36, 0.36), (0.55, 0.45, 0.70), (0.90, 0.75, 0.35), (0.35, 0.58, 0.72),
+    (0.72, 0.52, 0.42), (0.55, 0.62, 0.35))
+"""Of objects on a table none of which is asked for, in turn."""
 
 
 @dataclass
@@ -69,7 +73,9 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
         raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
     camera = _camera(robot, recorder)
     still = [Mesh(mesh.vertices, mesh.faces, FIXTURE_COLOUR) for thing in recorder.fixtures for mesh in object_meshes(thing)]
-    pictures = [Image.fromarray(_frame(robot, recorder.objects, still, camera, *frame)) for frame in recorder.frames]
+    colours = [colour_of(i, recorder.plan is not None) for i in range(len(recorder.objects))]
+    things = list(zip(recorder.objects, colours, strict=True))
+    pictures = [Image.fromarray(_frame(robot, things, still, camera, *frame)) for frame in recorder.frames]
     lengths = [1000 // RATE] * (len(pictures) - 1) + [1000]
     kind = FORMATS[path.suffix.lower()]
     options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
@@ -87,15 +93,21 @@ def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
     return result
 
 
+def colour_of(number: int, asked: bool) -> Colour:
+    """Of an object by its number, where the first one is asked for, or none is."""
+    if not asked:
+        return THING_COLOURS[number % len(THING_COLOURS)]
+    return OTHER_COLOUR if number else OBJECT_COLOUR
+
+
 def _frame(
-    robot: Robot, objects: Sequence[ObjectModel], still: Sequence[Mesh], camera: Camera, arm: Float[np.ndarray, " n_arm"],
-    hand: Float[np.ndarray, " n_dof"], poses: Float[np.ndarray, "o 4 4"],
+    robot: Robot, objects: Sequence[tuple[ObjectModel, Colour]], still: Sequence[Mesh], camera: Camera,
+    arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], poses: Float[np.ndarray, "o 4 4"],
 ) -> UInt8[np.ndarray, "height width 3"]:
     things = []
-    for i, (obj, T) in enumerate(zip(objects, poses, strict=True)):
+    for (obj, colour), T in zip(objects, poses, strict=True):
         assert obj.vertices is not None
         assert obj.faces is not None
-        colour = OTHER_COLOUR if i else OBJECT_COLOUR
         things.append(Mesh(obj.vertices @ T[:3, :3].T + T[:3, 3], obj.faces, colour))
     return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), *still, *things], camera, *SIZE)
 
@@ -104,9 +116,10 @@ def _camera(robot: Robot, recorder: Recorder) -> Camera:
     """A camera that has the whole motion in its picture, and the part of the table around it."""
     moved = [mesh.vertices for arm, hand, _ in recorder.frames[:: max(1, len(recorder.frames) // 8)]
              for mesh in robot_meshes(robot, arm, hand)]
-    places = np.stack([recorder.frames[row][2][:, :3, 3] for row in (0, -1)])  # of all objects
-    table = robot.table or Table()
-    square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # [m] (ours)
-    around = (places[:, :1, None, :2] + square).reshape(-1, 2)
-    corners = np.column_stack([around, np.full(len(around), table.height)])
-    return Camera.around(np.concatenate([*moved, places.reshape(-1, 3), corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)
+    things = [obj.vertices @ T[:3, :3].T + T[:3, 3] for row in (0, -1)
+              for obj, T in zip(recorder.objects, recorder.frames[row][2], strict=True) if obj.vertices is not None]
+    things += [thing.cloud.astype(np.float64) for thing in recorder.fixtures]
+    square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # around the first object [m] (ours)
+    around = recorder.frames[0][2][:1, :2, 3] + square
+    corners = np.column_stack([around, np.full(len(around), (robot.table or Table()).height)])
+    return Camera.around(np.concatenate([*moved, *things, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

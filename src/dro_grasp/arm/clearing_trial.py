@@ -17,6 +17,7 @@ from dro_grasp.arm.table_setup import Region, scatter
 from dro_grasp.arm.tabletop import TabletopConfig, Watcher
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.scan import depth_points
@@ -78,7 +79,10 @@ class SimulatedRig:
         assert camera is not None
         self._looks += 1
         depth, _ = depth_image(self.scene, camera, self._noise, self._seed + self._looks)
-        return depth_points(depth, thinned_intrinsics(camera))
+        points = depth_points(depth, thinned_intrinsics(camera))
+        if self._watch is not None:
+            self._watch.looked(points)
+        return points
 
     def move(self, arm: Trajectory, hand: Trajectory) -> None:
         """As of `Rig`."""
@@ -117,14 +121,18 @@ def clear_trial(
     judgements = list[tuple[str, bool]]()
     picks, reason = list[Pick](), ""
 
+    def judged(check: HoldCheck) -> None:
+        judgements.append((check.state, rig.holds()))
+        if watch is not None:
+            watch.judged(check, judgements[-1][1])
+
     def picked(pick: Pick) -> None:
         picks.append(pick)
         if progress is not None:
             progress(pick)
 
     try:
-        cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, picked,
-                              lambda check: judgements.append((check.state, rig.holds())))
+        cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, picked, judged)
     except PlanError as error:  # as on a robot, a person has to help; what is removed counts
         cleared, reason = Cleared(tuple(picks), ()), str(error)
     scene.advance(1.0)

@@ -310,7 +310,7 @@ def candidates(
     if isinstance(given, GraspBatch):
         yield given, True
         return
-    make = given or _predicted(task, predictor or GraspPredictor())
+    make = given or predicted(task, predictor or GraspPredictor())
     for batch in range(task.config.batches):
         with tries.watch("grasps"):
             try:
@@ -320,8 +320,8 @@ def candidates(
         yield made, batch + 1 == task.config.batches
 
 
-def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
-    """What makes grasps from a seed."""
+def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
+    """What makes grasps in the world's frame from a seed."""
     directions: Directions | Float[Tensor, "k 3"] = task.config.directions
     if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
         middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]

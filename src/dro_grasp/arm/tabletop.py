@@ -29,6 +29,7 @@ from dro_grasp.arm.table_setup import Region, other_objects, scatter
 from dro_grasp.arm.workcell import Workcell, moved
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName, depth_noise
 from dro_grasp.objects.scenery import load_scene
@@ -131,6 +132,12 @@ class Watcher:
 
     def moved(self, scene: LiftScene) -> None:
         """Time has passed; called at least fifty times a second of simulated time."""
+
+    def looked(self, points: Float[np.ndarray, "n 3"]) -> None:
+        """A camera has seen these points, in its frame [m]; only told where a table is cleared, as the next one."""
+
+    def judged(self, check: HoldCheck, held: bool | None = None) -> None:
+        """The joints were asked whether the hand holds something; whether it really does, where that is known."""
 
 
 def attempt(

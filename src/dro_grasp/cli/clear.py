@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,11 +11,13 @@ from dro_grasp.cli.inputs import Flag, Friction, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
+    from dro_grasp.arm.clear_record import ClearRecorder
     from dro_grasp.arm.clearing import Pick
     from dro_grasp.arm.clearing_trial import ClearTrialConfig
+    from dro_grasp.arm.robot import Robot
 
 
-VIDEO_RATE = 2.5  # Pictures for each simulated second: the animation is four times as fast (ours)
+VIDEO_EVERY = 4  # The animation shows each fourth moment that is recorded, and is four times as fast (ours)
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,14 @@ class Clear:
     seed."""
     video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None
     """Animation of the first table, four times as fast; the table is cleared for it."""
+    record: Annotated[Path | None, optional("NPZ", "not kept")] = None
+    """The first table, kept moment by moment: `dro-grasp view` plays it. The table is cleared for it."""
     json: Flag = False  # Print one JSON object instead of text.
 
     def run(self) -> int:
         """Clear what is missing, store and print."""
-        from dro_grasp.arm.animation import FORMATS, Recorder, draw_animation
+        from dro_grasp.arm.animation import FORMATS
+        from dro_grasp.arm.clear_record import ClearRecorder
         from dro_grasp.arm.clearing_trial import clear_trial
         from dro_grasp.arm.robot import load_robot
         from dro_grasp.errors import OptionError
@@ -66,6 +71,8 @@ class Clear:
             check_output(self.video, *FORMATS)
         if self.output is not None:
             check_output(self.output, ".jsonl")
+        if self.record is not None:
+            check_output(self.record, ".npz")
         names = resolve_objects(list(self.objects))
         count = len(names) if self.things is None else self.things
         if self.tables < 1 or not 1 <= count <= len(names):
@@ -78,15 +85,22 @@ class Clear:
         predictor = GraspPredictor(self.weights)
         done = list[dict[str, Any]]()
         for number in range(self.tables):
-            if number not in known or (self.video is not None and number == 0):
-                recorder = Recorder(VIDEO_RATE) if self.video is not None and number == 0 else None
+            kept = number == 0 and (self.video is not None or self.record is not None)
+            if number not in known or kept:
+                recorder = ClearRecorder() if kept else None
+
+                def picked(pick: Pick, recorder: ClearRecorder | None = recorder) -> None:
+                    if recorder is not None:
+                        recorder.picked(pick)
+                    if not self.json:
+                        _say(pick)
+
                 drawn = [load_object(names[i]) for i in _drawn(len(names), count, self.seed, number)]
-                made = clear_trial(robot, drawn, number, self.seed, predictor, config, recorder, None if self.json else _say)
+                made = clear_trial(robot, drawn, number, self.seed, predictor, config, recorder, picked)
                 known[number] = asdict(made)
                 _append(self.output, {"table": number, **asdict(made), "key": key})
-                if recorder is not None and self.video is not None:
-                    draw_animation(robot, recorder, self.video)
-                    say_aside(f"video: {self.video}")
+                if recorder is not None:
+                    self._keep(robot, recorder)
             done.append(known[number])
         self._report(done)
         return 0
@@ -99,6 +113,17 @@ class Clear:
         box = Bin() if self.bin is None else Bin(self.bin[:2], self.bin[2:4], self.bin[4])
         plan = PlanConfig(self.num, rehearsals=self.rehearsals, friction=self.friction)
         return ClearTrialConfig(friction=self.friction, clear=ClearConfig(box, self.tries, plan=plan))
+
+    def _keep(self, robot: Robot, recorder: ClearRecorder) -> None:
+        """Write what was recorded, and its animation."""
+        from dro_grasp.arm.animation import draw_animation
+
+        if self.record is not None:
+            recorder.record(robot, self.robot).save(self.record)
+            say_aside(f"record: {self.record} (dro-grasp view {self.record} plays it)")
+        if self.video is not None:
+            draw_animation(robot, replace(recorder, frames=recorder.frames[::VIDEO_EVERY]), self.video)
+            say_aside(f"video: {self.video}")
 
     def _report(self, done: list[dict[str, Any]]) -> None:
         from dro_grasp.compare.metrics import wilson_interval

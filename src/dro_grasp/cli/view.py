@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,30 +18,36 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from threading import Lock
 
-    from dro_grasp.apps.viewer.scene_view import Client, ServedPage
+    from dro_grasp.apps.viewer.scene_view import Client, Page, ServedPage
     from dro_grasp.apps.viewer.studio import Studio
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
 
+ROBOT = "robot"  # What --camera says for the camera of the robot file
 MAX_SIDE = 4096  # Largest width and height of one picture [pixels]
 MAX_PIXELS = 50_000_000  # Most pixels of all pictures on a sheet together
 
 
 @dataclass(frozen=True)
 class View:
-    """View grasps, the plan of a lift, or attempts of an arm in the browser, or make grasps there. Needs the extra `[apps]`.
+    """View grasps, a camera's scene, plans and runs of an arm in the browser, or make grasps there. Needs the extra `[apps]`.
 
-    Example: dro-grasp view grasps.parquet
+    Examples: dro-grasp view grasps.parquet; dro-grasp view --scene depth.png --camera camera.json --hand allegro
     """
 
     file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
-    """Grasp file, or a folder of them; a plan; or attempts of `dro-grasp tabletop`. Without it, the page lets
-    you choose a hand and an object, generate grasps, watch trials and export."""
+    """Grasp file, or a folder of them; a plan; attempts of `dro-grasp tabletop`; or a record of `dro-grasp clear`. Without it,
+    the page lets you choose a hand and an object, generate grasps, watch trials and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to show first: a name in the file, or a mesh to use for the file's only object. Without a file: any object."""
-    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
+    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object, or of --scene.
+    scene: Annotated[Path | None, optional("CLOUD|DEPTH", "none")] = None
+    """What a camera saw, a cloud or a depth image: click a thing in it, and see grasps of it with all else as obstacles; with
+    --robot, also plan and play the motion. Without --camera, the cloud is in the frame of the grasps."""
+    camera: Annotated[str | None, optional("JSON|robot", "none")] = None
+    """Camera of the scene, as for `dro-grasp generate`; or `robot` for that of the robot file."""
     port: int = 8080  # Port to serve on; if it is taken, the next free one.
     host: str = "127.0.0.1"
     """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network and needs a token."""
@@ -48,7 +55,7 @@ class View:
     """Token that browsers must know; the address that is printed holds it."""
     attempt: int = 0  # Number of the attempt in the file to run again and show first.
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Robot to use instead of the one named in a plan or an attempt."""
+    """Robot to use instead of the one named in a plan, an attempt or a record; or whose hand grasps in the scene."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights, or the attempts' own")] = None
     """Weights for grasps generated on the page, or to use instead of those of the attempts."""
     device: str = "cpu"  # Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1.
@@ -61,10 +68,21 @@ class View:
         from dro_grasp.apps.viewer.scene_view import serve
 
         token = self.token or os.environ.get(TOKEN) or None
+        self._check_scene()
+        if self.scene is not None:
+            from dro_grasp.apps.viewer.studio import StudioServer
+
+            (show or serve)(StudioServer(self._of_scene(self.scene), self.port, self.host, token))
+            return 0
         if self.file is not None and is_motion(self.file):
             require_extra("arm")
+            from dro_grasp.apps.viewer.clear_page import clear_page
             from dro_grasp.apps.viewer.lift_page import lift_page
+            from dro_grasp.arm.clear_record import is_record
 
+            if is_record(self.file):
+                (show or serve)(clear_page(self.file, self.robot, self.port, self.host, token))
+                return 0
             (show or serve)(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host, token=token))
             return 0
         from dro_grasp.apps.viewer.studio import StudioServer
@@ -72,6 +90,53 @@ class View:
         (show or serve)(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host,
                                       token))
         return 0
+
+    def _check_scene(self) -> None:
+        """Refuse options that contradict one another, by an OptionError."""
+        from dro_grasp.errors import OptionError
+
+        if self.scene is None:
+            if self.camera is not None:
+                raise OptionError("--camera is that of a scene; give the scene, too: --scene CLOUD|DEPTH")
+            return
+        for option, value in (("FILE", self.file), ("--object", self.object)):
+            if value is not None:
+                raise OptionError(f"--scene and {option} are given; leave out one of them: the thing is chosen on the page")
+        if self.robot is not None and self.hand is not None:
+            raise OptionError("--robot and --hand are given, and the robot has a hand; leave out one of them")
+        if self.camera == ROBOT and self.robot is None:
+            raise OptionError("--camera robot is that of a robot file; name the robot, too: --robot NAME|PATH")
+
+    def _of_scene(self, file: Path) -> Callable[[Client, Lock], Page]:
+        """What makes the page of a scene, which is read and taken apart once for all browsers."""
+        from dro_grasp.extras import require_extra
+        from dro_grasp.hands.library import load_hand
+        from dro_grasp.objects.perception.scene_files import SceneCamera
+        from dro_grasp.objects.scenery import load_scene
+        from dro_grasp.predict.predictor import GraspPredictor
+
+        camera: SceneCamera | str | None = self.camera
+        if self.robot is None:
+            from dro_grasp.apps.viewer.scene_page import ScenePage
+
+            hand = load_hand(self.hand or "allegro")
+            scene = load_scene(file, scale=self.scale, camera=camera)
+            made = partial(ScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, hand=hand)
+        else:
+            require_extra("arm")
+            from dro_grasp.apps.viewer.scene_motion import RobotScenePage
+            from dro_grasp.arm.robot import load_robot
+            from dro_grasp.errors import OptionError
+
+            robot = load_robot(self.robot)
+            if camera == ROBOT:
+                if robot.camera is None:
+                    raise OptionError(f"robot '{robot.name}' states no camera; give --camera JSON, or state it in its file")
+                camera = SceneCamera(robot.camera.T_world_camera, robot.camera.intrinsics, "world")
+            scene = load_scene(file, scale=self.scale, camera=camera)
+            made = partial(RobotScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, robot=robot)
+        _ = scene.segments  # refused before a browser comes
+        return lambda client, turn: made(client, turn=turn)
 
     def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:
         """What makes a page that shows the grasps of a file."""

@@ -45,7 +45,7 @@ def draw_scene(scene: Scene, found: FoundObject | Chosen | None, path: Path | st
     points = np.concatenate([points for points, _ in groups])
     assert scene.sight is not None
     eye = scene.sight.T[:3, 3] if scene.sight.from_camera else points.mean(0) + np.array([0.0, -1.0, 1.0])
-    up = _upward(scene)
+    up = upward(scene)
     meshes = [dots(points, colour, _radius(points)) for points, colour in groups if len(points)]
     towards = eye - points.mean(0)
     turned = _turned(towards, up)
@@ -90,7 +90,7 @@ def _radius(points: Float[np.ndarray, "n 3"]) -> float:
     return 0.003 if len(points) < MOST_DOTS // 2 else 0.004
 
 
-def _upward(scene: Scene) -> tuple[float, float, float]:
+def upward(scene: Scene) -> tuple[float, float, float]:
     """Upward direction of the picture: that of the largest plane, or of the frame."""
     assert scene.sight is not None
     if not scene.segments.planes:

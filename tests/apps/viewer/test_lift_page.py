@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.apps.viewer.lift_page import EVERY, Film, LiftPage, lift_page
+from dro_grasp.apps.viewer.film import Film
+from dro_grasp.apps.viewer.lift_page import EVERY, LiftPage, lift_page
 from dro_grasp.arm.animation import Recorder
 from dro_grasp.arm.attempts import Attempt, write_attempts
 from dro_grasp.arm.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
@@ -47,8 +49,8 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
         last = len(page.film.arm) - 1
         page.show_moment(last)
         expected = shape_poses(robot, plan.arm.position[-1], plan.hand.position[-1])
-        assert len(page._links) == len(robot_shapes(robot))
-        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert len(page.arm_view.links) == len(robot_shapes(robot))
+        assert np.allclose([handle.position for handle in page.arm_view.links], expected[:, :3, 3], atol=1e-6)
         motion = robot.T_world_wrist(plan.arm.position[-1]) @ np.linalg.inv(robot.T_world_wrist(robot.home))
         assert np.allclose(page._clouds[0].position, motion[:3, 3], atol=1e-6)
         assert np.linalg.norm(motion[:3, 3]) > 0.05
@@ -59,6 +61,30 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
         assert "3 grasps: 1 out of reach" in page.text.content
     finally:
         page.stop()
+
+
+def test_played_lifts_say_what_the_joints_say_of_the_hand(robot: dro.Robot, plan: dro.MotionPlan) -> None:
+    """Held where the fingers are where the object stops them, empty where they went on; nothing before the lift."""
+    n = len(robot.hand_joints)
+    squeezed, empty = np.full(n, 0.5), np.full(n, 0.9)
+    hold = {"held_joints": squeezed, "held_torque": np.zeros(n), "empty_joints": empty, "empty_torque": np.zeros(n),
+            "hold_unit": np.ones(n)}
+    told = replace(plan, notes=replace(plan.notes, hold={name: tuple(row.tolist()) for name, row in hold.items()}))
+    recorder = Recorder(10.0, plan=told)
+    for joints in (squeezed, empty):
+        recorder.frames += [(robot.home, joints, np.eye(4)[None])] * 15  # of 2 s, of which the last 0.4 s are the lift
+    film = Film.of_attempt(recorder)
+    assert film.held[:15] == (None,) * 15
+    recorder.frames = recorder.frames[::-1]
+    late = Film.of_attempt(recorder)
+    for made, state in ((film, "empty"), (late, "held")):
+        last = made.held[-1]
+        assert last is not None
+        assert last[0] == state
+        assert f"the hand is **{state}**" in made.words[-1]
+    assert film.words[0].startswith("**reach**")
+    assert film.words[-1].startswith("**after the lift**")
+    assert Film.of_plan(robot, plan).held == ()
 
 
 def test_each_attempt_is_played_with_its_own_robot_and_weights(
@@ -84,9 +110,9 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
         page.repeat(1)
         assert ran == [(robot.name, 0, dro.load_weights(own).name), (other.name, 1, DEFAULT)]
         assert page.name.content == f"**{other.name}**"
-        assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
+        assert len(page.arm_view.links) == len(robot_shapes(other)) != len(robot_shapes(robot))
         expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
-        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert np.allclose([handle.position for handle in page.arm_view.links], expected[:, :3, 3], atol=1e-6)
         assert "Not as stored**: with other content than then: object. held" in page.text.content
     finally:
         page.stop()

@@ -3,70 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import viser
-from jaxtyping import Float
 
+from dro_grasp.apps.viewer.film import RATE, Film
+from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
-from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
+from dro_grasp.arm.animation import VIEW, Recorder, colour_of
 from dro_grasp.arm.attempts import Attempt, read_attempts
-from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, READY, WAITING, MotionPlan
-from dro_grasp.arm.reachability import carried
+from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.robot import Robot, load_robot
-from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
+from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
 from dro_grasp.network.checkpoints import describe_weights
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
 from dro_grasp.predict.predictor import GraspPredictor
 
-RATE = 25.0  # Pictures a second (ours)
 DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)  # Grey of grasps that were dropped
 WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)  # Yellow of grasps that were not tried
 NONE = "none"  # Choice of no grasps
 EVERY = "all"  # Choice of every grasp
-
-
-@dataclass(frozen=True, eq=False)
-class Film:
-    """A motion, picture by picture."""
-
-    arm: Float[np.ndarray, "k n_arm"]  # [rad or m]
-    hand: Float[np.ndarray, "k n_dof"]  # [rad or m]
-    poses: Float[np.ndarray, "k o 4 4"]  # Of the objects in the world [m]; of a plan, those of the cloud that it was made for
-    plan: MotionPlan | None
-    objects: tuple[ObjectModel, ...] = ()  # As simulated; none in a plan
-
-    @staticmethod
-    def of_plan(robot: Robot, plan: MotionPlan) -> Film:
-        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down."""
-        points = list(plan.points(RATE))
-        arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
-        wrist = robot.T_world_wrist(arm)
-        stage = np.array([ALL_STAGES.index(p.stage) for p in points])
-        lifts, releases = ALL_STAGES.index("lift"), ALL_STAGES.index("release")
-        start, held = plan.held_from(robot), (stage >= lifts) & (stage < releases)
-        poses = np.tile(np.eye(4), (len(points), 1, 1, 1))
-        poses[held, 0] = np.stack([carried(T, start) for T in wrist[held]])
-        if (stage >= releases).any():
-            end = robot.T_world_wrist(plan.arm.position[plan.part("lower")][-1])
-            poses[stage >= releases, 0] = carried(end, start)
-        return Film(arm, hand, poses, plan)
-
-    @staticmethod
-    def of_attempt(recorder: Recorder) -> Film:
-        """What was simulated."""
-        if not recorder.frames:
-            raise OptionError("the attempt ended before the robot moved; there is nothing to play")
-        arm, hand, poses = (np.stack(part) for part in zip(*recorder.frames, strict=True))
-        return Film(arm, hand, poses, recorder.plan, recorder.objects)
 
 
 class LiftPage(ServedPage, Page):
@@ -92,25 +54,16 @@ class LiftPage(ServedPage, Page):
         ServedPage.__init__(self, port, host, token)
         Page.__init__(self, self.server)
         self.film: Film | None = None
+        self.arm_view = RobotView(self.server)
+        self._sign = HoldSign(self.arm_view)
         self._add_controls()
         self._put(robot)
 
     def _put(self, robot: Robot) -> None:
         """Show a robot at home beside its table, in the place of another one."""
-        scene, self.robot = self.server.scene, robot
+        self.robot = robot
         self.name.content = f"**{escaped(robot.name)}**"
-        for name in ("/robot", "/table"):
-            scene.remove_by_name(name)
-        self._links = [
-            scene.add_mesh_simple(f"/robot/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour), side="double")
-            for i, mesh in enumerate(robot_shapes(robot))]
-        self._place(robot.home, robot.hand.canonical_joints().double().numpy())
-        for i, mesh in enumerate(table_meshes(robot.table)):
-            scene.add_mesh_simple(f"/table/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour))
-
-    def _place(self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> None:
-        for handle, T in zip(self._links, shape_poses(self.robot, arm, hand), strict=True):
-            move(handle, T)
+        self.arm_view.put(robot)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -165,7 +118,7 @@ class LiftPage(ServedPage, Page):
             assert obj.vertices is not None
             assert obj.faces is not None
             self._things.append(scene.add_mesh_simple(
-                f"/things/{i}", obj.vertices, obj.faces, color=rgb(OTHER_COLOUR if i else OBJECT_COLOUR), side="double"))
+                f"/things/{i}", obj.vertices, obj.faces, color=rgb(colour_of(i, True)), side="double"))
         self._clouds, said = [], [outcome]
         if film.plan is not None:
             for name, points, colour in (("object", film.plan.scene.points, SOLVED_COLOUR),
@@ -188,11 +141,13 @@ class LiftPage(ServedPage, Page):
         if film is None:
             return
         with self.server.atomic():
-            self._place(film.arm[moment], film.hand[moment])
+            self.arm_view.place(film.arm[moment], film.hand[moment])
             moving = self._things or self._clouds[:1]
             for handle, T in zip(moving, film.poses[moment], strict=False):
                 move(handle, T)
-            self.text.content = f"{moment / RATE:.1f} s  \n{self._said}"
+            self._sign.show(film.arm[moment], film.held[moment] if film.held else None)
+            words = f" {film.words[moment]}" if film.words else ""
+            self.text.content = f"{moment / RATE:.1f} s{words}  \n\n{self._said}"
 
     def _play(self) -> None:
         assert self.film is not None
@@ -220,10 +175,8 @@ class LiftPage(ServedPage, Page):
     def _aim(self) -> None:
         """Look at the whole motion."""
         assert self.film is not None
-        every = max(1, len(self.film.arm) // 6)
-        meshes = [mesh for q, hand in zip(self.film.arm[::every], self.film.hand[::every], strict=True)
-                  for mesh in robot_meshes(self.robot, q, hand)]
-        self.view.aim(Camera.around(np.concatenate([m.vertices for m in meshes]), VIEW, aspect=4 / 3))
+        points = self.arm_view.swept(self.film.arm, self.film.hand)
+        self.view.aim(Camera.around(points, VIEW, aspect=4 / 3))
 
 
 def lift_page(

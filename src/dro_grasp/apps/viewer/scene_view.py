@@ -45,6 +45,7 @@ CAMERA_DISTANCE = 1.15  # Initial camera distance, as a multiple of that of a pi
 ASPECT = 4 / 3  # Width over height of a window from which on nothing is cut off
 NARROW = 1.0  # Width over height of a window below which the panel covers its lower half, as on a phone
 RAISED = 0.27  # Share of its height by which hand and object then stand above the middle (ours)
+CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does [s] (ours)
 GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 
 Point = tuple[float, float, float]  # A place [m]
@@ -265,6 +266,11 @@ class Page(ABC):
         """Whether nobody sees the page any more."""
         self._busy = threading.Lock()
 
+    def close(self) -> None:
+        """End what the page does."""
+        self.closed.set()
+        self._busy.acquire(timeout=CLOSE_TIMEOUT)  # never released: nothing is done on this page any more
+
     @abstractmethod
     def show_moment(self, moment: int) -> None:
         """Show one picture of the film, if there is one."""
@@ -281,9 +287,9 @@ class Page(ABC):
         self.play.on_click(lambda _: self._guarded(self._play))
         self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
 
-    def _roll(self, film: Any, moments: int, interval: float) -> bool:
-        """Show a film picture by picture, each for an interval [s]; False if another took its place."""
-        for moment in range(moments):
+    def _roll(self, film: Any, moments: int, interval: float, first: int = 0) -> bool:
+        """Show a film picture by picture from the first on, each for an interval [s]; False if another took its place."""
+        for moment in range(first, moments):
             begin = time.monotonic()
             if self.film is not film:
                 return False

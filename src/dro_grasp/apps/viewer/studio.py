@@ -17,7 +17,7 @@ import viser
 from dro_grasp.apps.library import Kind, Library
 from dro_grasp.apps.viewer.constraint_panel import NOTHING, OBJECT_FILES, ConstraintPanel, given_number
 from dro_grasp.apps.viewer.grasp_page import GraspPage, ShownGrasps
-from dro_grasp.apps.viewer.scene_view import HOST, Client, Closed, ServedPage, escaped
+from dro_grasp.apps.viewer.scene_view import HOST, Client, Closed, Page, ServedPage, escaped
 from dro_grasp.errors import DroGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import made_for_another, object_of
@@ -38,7 +38,6 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 MAX_GRASPS = 64  # Most grasps of one click (ours)
 MAX_CANDIDATES = 8  # Most candidates for each of them (ours)
 TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still open [s] (ours)
-CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does before its uploads are deleted [s] (ours)
 
 
 class Studio(GraspPage):
@@ -69,8 +68,7 @@ class Studio(GraspPage):
 
     def close(self) -> None:
         """End what the page does, and delete its uploads."""
-        self.closed.set()
-        self._busy.acquire(timeout=CLOSE_TIMEOUT)  # never released: nothing is done on this page any more
+        super().close()
         self.library.close()
 
     def open(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None, first: str | None = None) -> None:
@@ -279,13 +277,13 @@ class StudioServer(ServedPage):
     """
 
     def __init__(
-        self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST,
+        self, make: Callable[[Client, threading.Lock], Page], port: int = 8080, host: str = HOST,
         token: str | None = None,
     ) -> None:
         """Start serving; `make` makes the page of a browser, with a lock that is the same for all."""
         super().__init__(port, host, token)
         self._make, self._turn = make, threading.Lock()
-        self.studios: dict[int, Studio] = {}
+        self.studios: dict[int, Page] = {}
         """Pages that are open, by the browser's number."""
         self.server.on_client_connect(self.enter)
         self.server.on_client_disconnect(self.leave)
