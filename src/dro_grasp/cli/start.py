@@ -11,7 +11,7 @@ import sys
 import threading
 from pathlib import Path
 
-TORCH = "torch"
+TORCH = "torch"  # Module that takes the longest to load
 OTHERS = ("numpy", "scipy.spatial", "dro_grasp.geometry.mesh_files", "mujoco")  # What does not need PyTorch
 ALLOCATIONS = 50_000
 """New objects after which Python looks for unused cycles (ours), of which loading leaves none; its own number is 700."""
