@@ -26,7 +26,7 @@ from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import ALL, Row, average
 from lab import pages
 from lab.benchmarks.report import ROOT
-from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART, TEST_OBJECTS
+from lab.measurements import FLAT_THINGS, MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART, TEST_OBJECTS
 from lab.runner import RESULTS
 from lab.studies import payload
 
@@ -253,6 +253,12 @@ def robot_tasks(results: Results) -> str:
         removed, things, picks = (sum(cell[key] for cell in done) for key in ("removed", "things", "picks"))
         also = f"{picks / removed:.2f} picks each, {sum(cell['tables'] for cell in done)} tables" if removed else ""
         lines.append(counts(f"things cleared, six on a table, `{robot}`", "cleared", things, removed, things, also))
+    for robot in ROBOTS:
+        tried = [a for name in FLAT_THINGS for cell in results.some("flat_lifts", f"{robot}, {name}") for a in cell["attempts"]]
+        ended = ", ".join(f"{stage} {count}" for stage, count in Counter(a["stage"] for a in tried).items())
+        good = sum(a["success"] for a in tried)
+        lines.append(counts(f"flat and thin things lifted, held and shaken, `{robot}`", "flat_lifts", len(tried), good,
+                            len(tried), ended))
     right, n = Counter[str](), Counter[str]()
     for row in (row for cell in results.some("holding") for row in cell["rows"]):
         if row["hand"] != "all" and row["measured"] == HELD_BY:

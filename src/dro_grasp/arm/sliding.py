@@ -197,6 +197,8 @@ class _Pusher:
         """Whether the arm reaches a grasp of the thing where it will be."""
         assert self.robot.table is not None
         there = moved(self.obj, push.motion)
+        if np.linalg.norm(there.centre_of_mass - self.robot.T_world_base[:3, 3]) > self.robot.longest_reach:
+            return False
         grasps = flat_grasps(self.robot.hand, there, self.robot.table)
         reach = Reachability(Workcell(self.robot, self.obstacles, there), replace(self.config.reach, seeds=3), self.seed)
         hopeless = reach.hopeless(grasps)
