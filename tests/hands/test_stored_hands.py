@@ -26,13 +26,6 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
 
 
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A cache that is empty."""
-    monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path))
-    return tmp_path
-
-
 @pytest.mark.parametrize("name", sorted(file.stem for file in BUILTIN_FOLDER.glob("*.urdf")))
 def test_a_hand_from_the_cache_is_the_one_that_is_built(name: str, own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built = build_hand(load_hand_description(name)[0], name=name)
