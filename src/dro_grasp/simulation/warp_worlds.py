@@ -69,7 +69,7 @@ class WarpWorlds:
 
     def set_const(self) -> None:
         """As of `Worlds`."""
-        for number in np.unique(self._scene):
+        for number in np.unique(self._scene).tolist():
             rows = np.flatnonzero(self._scene == number)
             own = self._on_processor(number, rows)
             own.set_const()
@@ -105,7 +105,7 @@ class WarpWorlds:
         state, missed = graphs.step(inputs, fields, count)
         with np.errstate(invalid="ignore"):
             sound = np.all([(np.abs(values) < LARGEST).all(1) for values in state.values()], 0)
-        for number in np.unique(self._scene[rows[missed]]):
+        for number in np.unique(self._scene[rows[missed]]).tolist():
             part = np.flatnonzero(missed & (self._scene[rows] == number))
             own = self._on_processor(number, rows[part]).ahead(
                 np.arange(len(part)), {name: values[part] for name, values in inputs.items()}, count)
