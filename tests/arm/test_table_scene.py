@@ -73,6 +73,13 @@ def test_a_speck_is_an_obstacle_too(table_cloud: np.ndarray, robot: dro.Robot) -
     assert np.abs(other.cloud - speck.mean(0)).max() < 3 * VOXEL
 
 
+def test_obstacles_may_be_larger_than_any_object(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    y, z = np.meshgrid(np.arange(-0.65, 0.65, 0.004), np.arange(0.0, 0.9, 0.004))
+    wall = np.stack([np.full(y.size, 0.9), y.ravel(), z.ravel()], 1)
+    (other,) = pick_object(load_scene(np.concatenate([table_cloud, wall])), robot, (*CUBE, 0.03)).obstacles
+    assert np.ptp(other.cloud, axis=0).max() > 1.0
+
+
 def test_what_is_beside_the_table_is_left_out(table_cloud: np.ndarray, robot: dro.Robot) -> None:
     assert robot.table is not None
     far = table_cloud[-6000:-3000] + np.array([2.0, 2.0, 0.0])

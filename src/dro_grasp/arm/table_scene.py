@@ -12,8 +12,8 @@ from dro_grasp.arm.flat_things import overhang, seen_flat
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import VOXEL
 from dro_grasp.errors import ObjectError, RobotError
+from dro_grasp.geometry.cache import content_hash
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.perception.choosing import Pixel, Spot, within
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
@@ -139,7 +139,5 @@ def _solid(points: Float[np.ndarray, "n 3"], table: float) -> list[ObjectModel]:
     np.maximum.at(tops, column.ravel(), points[:, 2])
     heights = [np.arange(top, min(table, top - VOXEL), -VOXEL) for top in tops]
     rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z]) for cell, z in zip(cells, heights, strict=True)]
-    solid = np.concatenate(rows)
-    if len(solid) < MIN_CLOUD:  # an obstacle all the same, in the same cells
-        solid = (solid[:, None] + VOXEL / 3 * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)).reshape(-1, 3)
-    return [cloud_object("other things", solid, origin="other things", keep_table=True)]
+    solid = np.concatenate(rows).astype(np.float32)  # of any size, unlike what is grasped
+    return [ObjectModel("other things", solid, np.zeros_like(solid), solid.mean(0, dtype=np.float64), content_hash(solid))]

@@ -32,7 +32,7 @@ def unpacked_cloud(text: str, name: str) -> ObjectModel:
     Raises:
         ObjectError: The text is none that `packed_cloud` writes.
     """
-    from dro_grasp.objects.cache import content_hash
+    from dro_grasp.geometry.cache import content_hash
     from dro_grasp.objects.shape import ObjectModel
 
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import scanned_object
 from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.pictures.scene import draw_scene
 from tests.helpers.made_scenes import MadeScene, looking, make_scene, overlap, render_scene
@@ -172,6 +174,17 @@ def test_what_reaches_the_border_is_cut_off() -> None:
     camera = SceneCamera(made.camera.T_frame_camera, K, "world")
     half = load_scene(made.depth[:, middle:], camera=camera).chosen(nearest=True)
     assert any("the image's border and may be cut off" in note for note in half.notes)
+
+
+def test_a_thing_of_which_nothing_is_left_is_told_with_its_place() -> None:
+    down = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera that looks down from 1 m
+    scene = load_scene((_table((0.2, 0.1)) - np.array([0, 0, 1])) @ down[:3, :3], camera=SceneCamera(down))
+    chosen = scene.chosen(nearest=True)
+    assert scene.sight is not None
+    over = [*scene.segments.planes[0][:3], scene.segments.planes[0][3] + 0.3]  # a plane above the thing
+    segments = replace(scene.segments, planes=(np.array(over),))
+    with pytest.raises(ObjectError, match=r"of the thing at 0\.20 .* 0 of .* points are above the plane .*mask=PNG"):
+        taken_object("thing", scene.sight, segments, chosen)
 
 
 def test_two_choices_contradict() -> None:

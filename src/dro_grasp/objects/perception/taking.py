@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import KDTree
 
+from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.table_plane import moved_plane
-from dro_grasp.objects.loading import cloud_object
-from dro_grasp.objects.perception.choosing import Chosen, Sight
+from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
+from dro_grasp.objects.perception.choosing import Chosen, Sight, place_of
 from dro_grasp.objects.perception.scan import scanned_object
 from dro_grasp.objects.perception.segmentation import Segments
 from dro_grasp.objects.shape import ObjectModel
@@ -31,6 +32,11 @@ def taken_object(name: str, sight: Sight, segments: Segments, chosen: Chosen) ->
         kept &= cloud @ table[:3] > table[3]
     if len(chosen.others):
         kept &= KDTree(sight.world()[chosen.others]).query(cloud)[0] > CLEAR
+    if kept.sum() < MIN_CLOUD:
+        place = place_of(sight.world()[chosen.own])
+        raise ObjectError(f"of the thing at {place} in '{name}', {int(kept.sum())} of {len(kept)} points are above the plane "
+                          "below it and apart from other things; look at a picture of the scene (draw_scene), and mean another "
+                          "thing, or give its pixels (mask=PNG)")
     rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[kept]
     obj = cloud_object(name, rows, origin=name, keep_table=True, seen=whole.seen)
     return replace(obj, table=table, notes=(*whole.notes, *chosen.notes))
