@@ -40,6 +40,8 @@ MOST = 32  # Most grasps of one thing (ours)
 TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still wanted [s] (ours)
 AROUND = 0.06  # Margin of a thing in the view of its grasps [m] (ours)
 LISTED = 6  # Grasps in the table (ours)
+UPRIGHT = 0.999  # Cosine of the scene's upward direction to z below which browsers have to turn the world first (ours)
+TURNING = 1.5  # Time that browsers get for that, since they place the camera in the world as it is turned then [s] (ours)
 PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 HAND_OVER = 0.3  # Time that work which ends has to take up what was asked for meanwhile [s] (ours)
 STEEP = 0.8  # Cosine of a palm to the vertical from which on it looks from above [1] (ours)
@@ -167,6 +169,9 @@ class ScenePage(Page):
         count = scene.segments.count
         self.thing.options = (NO_THING, *(self._thing_name(k) for k in range(count)))
         self.thing.value, self.notes.content = NO_THING, ""
+        if abs(cloud.up[2]) < UPRIGHT:
+            self.client.flush()
+            time.sleep(TURNING)
         self.view.aim(self._first_view())
         shows = f"{count} thing{'s' * (count != 1)}. {FIRST}" if count else NO_THINGS
         self._say(f"**{escaped(scene.name)}** shows {shows}")
