@@ -21,7 +21,8 @@ from dro_grasp.pictures.scene import OBSTACLE_COLOUR, STRAY_COLOUR, STRUCTURE_CO
 CELL = 0.003  # Edge of the cubes of which one point each is drawn [m] (ours)
 MOST = 120_000  # Most points that are drawn (ours)
 GUESSED = 0.006  # Points farther than this from all that was seen are estimated [m] (ours)
-POINT = 0.0032  # Size of a drawn point [m]
+POINT = 0.0032  # Least size of a drawn point [m]
+LARGEST_POINT = 0.02  # Largest such size [m]
 GUESSED_COLOUR: Colour = (0.98, 0.78, 0.52)  # Pale orange of what was not seen, but is likely there
 NEIGHBOURS = 24  # Points of which normals are found (ours)
 DARK = 0.45  # Brightness of what no light reaches [1] (ours)
@@ -49,6 +50,7 @@ class SceneCloud:
         rows = np.sort(one_per_cell(self.world, CELL))
         self._rows = rows[:: -(-len(rows) // MOST)]
         self.up = upward(scene)
+        self.point = point_size(self.world[self._rows])
         self._shade = np.ones(len(self.world))
         self._shade[self._rows] = shades(normals_of(self.world[self._rows]), np.asarray(self.up))
         client.scene.set_up_direction(self.up)
@@ -82,7 +84,7 @@ class SceneCloud:
     ) -> None:
         if len(points):
             self._client.scene.add_point_cloud(
-                f"/scene/{name}", points.astype(np.float32), (colours * shade[:, None]).astype(np.uint8), point_size=POINT,
+                f"/scene/{name}", points.astype(np.float32), (colours * shade[:, None]).astype(np.uint8), point_size=self.point,
                 point_shape="circle", precision="float32")
 
     @property
@@ -124,6 +126,13 @@ class SceneCloud:
         angle = min(math.atan2(height, across), ELEVATION)
         x, y, z = (math.cos(angle) * flat + math.sin(angle) * up).tolist()
         return Camera.around(points, (x, y, z), self.up, aspect=4 / 3)
+
+
+def point_size(points: Float[np.ndarray, "n 3"]) -> float:
+    """Size at which neighbours of a cloud overlap [m]; rooms are seen with points far apart."""
+    some = points[:: max(1, len(points) // 2000)]
+    apart = float(np.median(KDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
+    return min(max(POINT, 1.3 * apart), LARGEST_POINT)
 
 
 def normals_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -40,18 +40,24 @@ MOST = 32  # Most grasps of one thing (ours)
 TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still wanted [s] (ours)
 AROUND = 0.06  # Margin of a thing in the view of its grasps [m] (ours)
 LISTED = 6  # Grasps in the table (ours)
+UPRIGHT = 0.999  # Cosine of the scene's upward direction to z below which browsers have to turn the world first (ours)
+TURNING = 1.5  # Time that browsers get for that, since they place the camera in the world as it is turned then [s] (ours)
 PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 HAND_OVER = 0.3  # Time that work which ends has to take up what was asked for meanwhile [s] (ours)
-STEEP, FLAT = 0.8, 0.4  # Cosines of a palm to the vertical between which it looks aslant [1] (ours)
+STEEP = 0.8  # Cosine of a palm to the vertical from which on it looks from above [1] (ours)
+FLAT = 0.4  # The same up to which it looks from the side [1] (ours)
 CAMERA_FILES = ".json"  # Files of cameras that a browser offers to upload
 FIRST = "**Click a thing** (blue), or pick it from the list."  # What to do first
 NO_THINGS = ("no thing: nothing of 4 cm² or more and at most 60 cm stands out of its tables and walls. Bring the camera "
              "nearer, or put things apart from walls, and look again.")
+"""What is said of a scene without things."""
 NOTHING_THERE = ("**Nothing is there:** your click meets no point. Click a blue thing, or pick it from the list; drag to turn "
                  "the view.")
-STRUCTURE_THERE = "**That is a table, wall or board,** and no thing. Click a blue thing."
+"""What is said of a click that meets no point."""
+STRUCTURE_THERE = "**That is a table, wall or board,** and no thing. Click a blue thing."  # What is said of a click on it
 UNKNOWN_THERE = ("**That was taken for no thing:** it is smaller than 4 cm², longer than 60 cm, or far away. Bring the camera "
                  "nearer and look again, or click a blue thing.")
+"""What is said of a click on points that are no thing's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +169,9 @@ class ScenePage(Page):
         count = scene.segments.count
         self.thing.options = (NO_THING, *(self._thing_name(k) for k in range(count)))
         self.thing.value, self.notes.content = NO_THING, ""
+        if abs(cloud.up[2]) < UPRIGHT:
+            self.client.flush()
+            time.sleep(TURNING)
         self.view.aim(self._first_view())
         shows = f"{count} thing{'s' * (count != 1)}. {FIRST}" if count else NO_THINGS
         self._say(f"**{escaped(scene.name)}** shows {shows}")

@@ -107,6 +107,7 @@ class SceneView:
     def _turn(self, client: viser.ClientHandle) -> None:
         """Turn a client's camera to what is shown, from farther away where its window is narrow."""
         if (camera := self._camera) is not None:
+            client.camera.up_direction = camera.up
             client.camera.position, client.camera.look_at = viewpoint(camera, client.camera.aspect)
             client.camera.fov = camera.field_of_view
 
