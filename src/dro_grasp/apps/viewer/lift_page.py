@@ -14,7 +14,7 @@ from jaxtyping import Float
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
 from dro_grasp.arm.attempts import Attempt, read_attempts
-from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, READY, WAITING, MotionPlan
+from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, READY, SLIDING, WAITING, MotionPlan
 from dro_grasp.arm.reachability import carried
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
@@ -46,9 +46,13 @@ class Film:
 
     @staticmethod
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:
-        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down."""
+        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down, or has pushed it."""
         points = list(plan.points(RATE))
         arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
+        if plan.notes.slide is not None:
+            ended = [SLIDING.index(p.stage) > SLIDING.index("slide") for p in points]
+            pushed = np.where(np.array(ended)[:, None, None, None], np.array(plan.notes.slide), np.eye(4))
+            return Film(arm, hand, pushed, plan)
         wrist = robot.T_world_wrist(arm)
         stage = np.array([ALL_STAGES.index(p.stage) for p in points])
         lifts, releases = ALL_STAGES.index("lift"), ALL_STAGES.index("release")
