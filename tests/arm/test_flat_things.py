@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 import dro_grasp as dro
+from dro_grasp.apps.viewer.lift_page import Film
 from dro_grasp.arm.flat_grips import flat_grasps, overhangs
 from dro_grasp.arm.flat_plans import plan_or_slide
 from dro_grasp.arm.flat_things import flat_object, overhang, seen_flat
@@ -215,6 +216,9 @@ def test_a_push_as_a_plan(narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPl
     assert "pushes object 'board'" in dro.trajectory_yaml(again)
     assert [stage["name"] for stage in dro.task_stages(again, narrow)][-2:] == ["retreat", "look again"]
     assert "then look again, and plan again" in made.lines()[0]
+    film = Film.of_plan(narrow, again)
+    assert np.array_equal(film.poses[0, 0], np.eye(4))
+    assert np.allclose(film.poses[-1, 0], made.notes.slide)
     with pytest.raises(PlanError, match="plan again"):
         again.check_hold(np.zeros(16))
 

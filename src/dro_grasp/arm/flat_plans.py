@@ -37,6 +37,13 @@ WIDEST = 0.09
 """Width up to which they are looked for at all [m] (ours): hands of a person's size clasp nothing flat that is wider."""
 
 
+def may_slide(robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether an object lies flat on the robot's table, and the hand has a thumb and two fingers to take it at an edge."""
+    if robot.table is None or robot.hand.thumb is None or len(robot.hand.fingers) < 3:
+        return False
+    return lies_flat(obj.cloud @ T_world_object[:3, :3].T + T_world_object[:3, 3], robot.table.height)
+
+
 @checked
 def plan_or_slide(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
@@ -79,13 +86,10 @@ def plan_or_slide(
     def usual() -> MotionPlan:
         return plan(robot, obj, T, obstacles, predictor, config, seed, start=start, place=place)
 
-    hand = robot.hand
-    if table is None or hand.thumb is None or len(hand.fingers) < 3:
+    if table is None or not may_slide(robot, obj, T):
         return usual()
-    thing = moved(obj, T)
+    hand, thing = robot.hand, moved(obj, T)
     points = np.asarray(thing.cloud, np.float64)
-    if not lies_flat(points, table.height):
-        return usual()
 
     def trusted_alone() -> MotionPlan:
         return _trusted(robot, thing, obstacles, predictor, config, seed, start, place)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from dro_grasp.arm.attempts import Attempt
 from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
-from dro_grasp.arm.flat_plans import plan_or_slide
+from dro_grasp.arm.flat_plans import may_slide, plan_or_slide
 from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
 from dro_grasp.arm.physics import FRICTION, TICK, Deviation, LiftScene, check_friction
 from dro_grasp.arm.placed import draw_place, measured, place_fault
@@ -172,7 +172,7 @@ def attempt(
             result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
             grasps = None if proposer is None else proposer(seen, T, seed + number)
             place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
-            if grasps is None and config.slide:
+            if grasps is None and config.slide and may_slide(seen.robot, seen.obj, T):
                 made = plan_or_slide(
                     seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, place=place)
             else:

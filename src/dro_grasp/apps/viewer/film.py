@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.arm.animation import Recorder
-from dro_grasp.arm.motion import ALL_STAGES, MotionPlan
+from dro_grasp.arm.motion import ALL_STAGES, SLIDING, MotionPlan
 from dro_grasp.arm.reachability import carried
 from dro_grasp.arm.robot import Robot
 from dro_grasp.errors import OptionError
@@ -20,6 +20,9 @@ WORDS = {
     "reach": "the arm travels to the thing, the hand open",
     "shape": "the hand takes the shape from which it closes",
     "approach": "straight to the grasp",
+    "press": "fingertips press the thing onto the table",
+    "slide": "they push it towards an edge of the table",
+    "look again": "the arm goes home, and the camera looks again",
     "close": "the hand closes and presses",
     "lift": "straight up",
     "carry": "the arm carries the thing to its place",
@@ -46,9 +49,14 @@ class Film:
 
     @staticmethod
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:
-        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down."""
+        """A plan as it is meant: the hand carries the object from the lift on, until it puts it down, or has pushed it."""
         points = list(plan.points(RATE))
         arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
+        words = tuple(_staged(p.stage) for p in points)
+        if plan.notes.slide is not None:
+            ended = np.array([SLIDING.index(p.stage) > SLIDING.index("slide") for p in points])
+            pushed = np.where(ended[:, None, None, None], np.array(plan.notes.slide), np.eye(4))
+            return Film(arm, hand, pushed, plan, words=words)
         wrist = robot.T_world_wrist(arm)
         stage = np.array([ALL_STAGES.index(p.stage) for p in points])
         lifts, releases = ALL_STAGES.index("lift"), ALL_STAGES.index("release")
@@ -58,7 +66,7 @@ class Film:
         if (stage >= releases).any():
             end = robot.T_world_wrist(plan.arm.position[plan.part("lower")][-1])
             poses[stage >= releases, 0] = carried(end, start)
-        return Film(arm, hand, poses, plan, words=tuple(_staged(p.stage) for p in points))
+        return Film(arm, hand, poses, plan, words=words)
 
     @staticmethod
     def of_attempt(recorder: Recorder) -> Film:
@@ -78,8 +86,9 @@ def moment_of(
     """What happens at a time [s] of a motion that follows a plan, and what the joints of the hand say then [rad or m]."""
     row = int(np.searchsorted(plan.arm.time, time, side="left"))
     over = row >= len(plan.stage)
-    stage = ALL_STAGES[int(plan.stage[min(row, len(plan.stage) - 1)])]
-    words = f"**after the lift**: {AFTER}" if over and plan.notes.place is None else _staged(stage)
+    names = ALL_STAGES if plan.notes.slide is None else SLIDING
+    stage = names[int(plan.stage[min(row, len(plan.stage) - 1)])]
+    words = f"**after the lift**: {AFTER}" if over and plan.notes.place is None and names is ALL_STAGES else _staged(stage)
     if plan.hold is None or stage not in MEASURED:
         return words, None
     check = plan.check_hold(joints)
