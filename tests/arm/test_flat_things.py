@@ -218,7 +218,7 @@ def test_a_push_as_a_plan(narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPl
     assert "then look again, and plan again" in made.lines()[0]
     film = Film.of_plan(narrow, again)
     assert np.array_equal(film.poses[0, 0], np.eye(4))
-    assert np.allclose(film.poses[-1, 0], made.notes.slide)
+    assert np.allclose(film.poses[-1, 0], np.array(made.notes.slide))
     with pytest.raises(PlanError, match="plan again"):
         again.check_hold(np.zeros(16))
 
