@@ -15,6 +15,7 @@ from dro_grasp.arm.clearing import Bin, ClearConfig, Pick, clear_table
 from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.grasps.hold import HoldCheck
 
 SPOTS = {"a": (0.45, 0.1), "b": (0.5, -0.15)}
 RADIUS = 0.03
@@ -52,6 +53,10 @@ class Table:
         return (self.moves[-1].position[-1] if self.moves else self.robot.home), self.robot.open_hand
 
 
+def judged(state: Any) -> HoldCheck:
+    return HoldCheck(state, 1.0, {state: 1.0})
+
+
 @pytest.fixture
 def placed(planned: MotionPlan) -> MotionPlan:
     """The plan of a lift, with a place of which nothing moves any more."""
@@ -87,11 +92,11 @@ def world(monkeypatch: pytest.MonkeyPatch, robot: dro.Robot, placed: MotionPlan)
             held = table.holds.pop(0)
             if isinstance(held, str):
                 table.there |= table.falls
-                return SimpleNamespace(state=held)
+                return judged(held)
             if held and not table.holds_twice:
                 table.there.pop(table.wanted)
             table.holds_twice = held and not table.holds_twice
-            return SimpleNamespace(state="held" if held else "empty")
+            return judged("held" if held else "empty")
 
         table.holds_twice, table.falls = False, {}
         monkeypatch.setattr(clearing, "plan", planned)
@@ -179,7 +184,7 @@ def test_what_is_out_of_sight_is_told(world: Any, robot: dro.Robot) -> None:
 def test_a_pick_counts_only_when_the_thing_is_gone(world: Any, robot: dro.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     table, _ = world([])
     table.there = {"a": (0.45, 0.1)}
-    monkeypatch.setattr(MotionPlan, "check_hold", lambda *given, **more: SimpleNamespace(state="held"))
+    monkeypatch.setattr(MotionPlan, "check_hold", lambda *given, **more: judged("held"))
     result = clear_table(robot, table, NOBODY, ClearConfig(tries=2))
     assert [pick.stage for pick in result.picks] == ["look", "look"]
     assert result.left[0].reason == "given up after 2 picks: it still stands there, as the camera sees it"

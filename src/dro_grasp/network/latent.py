@@ -113,7 +113,7 @@ class FlowPrior(nn.Module):
         if not condition.requires_grad:
             return repeat(step, noise, self.STEPS)
         z = noise
-        for number in torch.arange(self.STEPS, device=z.device):  # a graph that is captured has no gradients
+        for number in torch.arange(self.STEPS, device=z.device).split(1):  # a graph that is captured has no gradients
             z = step(z, number)
         return z
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Num, Shaped
+from jaxtyping import Bool, Float, Num, Shaped
 from PIL import Image
 
 from dro_grasp.errors import ObjectError, OptionError
@@ -95,7 +95,7 @@ def read_depth(path: Path, camera: SceneCamera | None) -> Num[np.ndarray, "h w"]
     return depth
 
 
-def read_mask(path: Path) -> Num[np.ndarray, "h w"]:
+def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     """A mask's pixels: not 0 on the object."""
     path = given_path(path)
     with reading(path, ObjectError, "a PNG that is not black on the object alone", Exception):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
 
 CELL = 0.004  # Edge of the cubes whose points are averaged [m] (ours): noise of single pixels goes, a finger's width stays
 NOISES = 2.0  # Standard deviations of the noise that a cube measures at least [1] (ours)
+REFITS = 2  # Fits to the points of a plane that is noisy (ours)
 MOST_EDGE = 0.008  # Largest edge for their sake [m] (ours)
 MOST_CELLS = 45_000  # Filled cubes above which they grow (ours): what two cores take apart in 2 s
 REACH = 1.5  # Points nearer to the camera than this count [m], and those up to twice the distance of the nearest (ours)
@@ -99,6 +101,7 @@ class _View:
     edge: float  # of the cubes [m]
     camera: Float[np.ndarray, "3"] | None
     cell_of: Int[np.ndarray, " n"]  # cube of each point; -1 for points too far away
+    points: Float[np.ndarray, "n 3"]  # [m]
 
     @classmethod
     def of(
@@ -114,7 +117,7 @@ class _View:
         normals = _normals(cells)
         if camera is not None:
             normals = normals * np.where(((camera - cells) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
-        return cls(cells, normals, edge, camera, cell_of)
+        return cls(cells, normals, edge, camera, cell_of, points)
 
 
 def _edge(view: _View, points: Float[np.ndarray, "n 3"]) -> float:
@@ -197,6 +200,9 @@ def _planes(view: _View) -> list[_Plane]:
         if fit is None:
             break
         plane = _seen_plane(view, pool, fit)
+        if view.edge > CELL:  # cubes that are as thick as the plane come in layers, of which the fit took one
+            for _ in range(REFITS):
+                plane = _seen_plane(view, pool, _fit_of_points(view, plane))
         if plane.area < LEAST_AREA:
             break
         if _is_structure(view, plane, found):
@@ -229,6 +235,21 @@ def _seen_plane(view: _View, pool: Int[np.ndarray, " p"], fit: Float[np.ndarray,
     side = view.camera @ fit[:3] - fit[3] if view.camera is not None else float(
         (height > thick).sum() - (height < -thick).sum())
     return _Plane(fit if side >= 0 else -fit, thick, axes, corner, patch, float(sizes.max()) * PATCH**2, own)
+
+
+def _fit_of_points(view: _View, plane: _Plane) -> Float[np.ndarray, "4"]:
+    """The plane through the points in its cubes, and in those over and under them: unit normal, and height along it [m]."""
+    near = np.flatnonzero(np.abs(plane.height(view.cells)) <= plane.thick + view.edge)
+    own = np.zeros(len(view.cells), bool)
+    own[near] = plane.beside(view.cells[near], 0)
+    own[near] &= np.abs(view.normals[near] @ plane.plane[:3]) > TILTED
+    points = view.points[(view.cell_of >= 0) & own[view.cell_of]]
+    if len(points) < 3:
+        return plane.plane
+    points = points[np.abs(plane.height(points)) <= 2 * plane.thick]
+    middle = points.mean(0)
+    normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
+    return np.append(normal, normal @ middle) * math.copysign(1.0, float(normal @ plane.plane[:3]))
 
 
 def _is_structure(view: _View, plane: _Plane, found: list[_Plane]) -> bool:
