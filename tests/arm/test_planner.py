@@ -236,7 +236,7 @@ def test_bad_input_is_refused_in_words_and_nothing_is_written(
 
 
 @pytest.mark.parametrize(("option", "said"), [("robot.yaml", "link 'link9', which the arm does not have"),
-                                              (None, "nothing stands on the table: 0 points are left")])
+                                              (None, "too large for a hand to grasp; if it is a camera's view")])
 def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
     option: str | None, said: str, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -367,7 +367,8 @@ def test_a_source_that_does_not_know_the_hand_is_not_asked(weights: str, ball: O
 
 
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
-    predictor = GraspPredictor(weights, config=PredictorConfig(network=ProposalConfig(temperature=1.0)))
+    network = ProposalConfig(temperature=1.0, choice=ChoiceConfig.first())  # a choice sees the surface, too
+    predictor = GraspPredictor(weights, config=PredictorConfig(network=network))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1, source="network")
     assert bool(made.score.isfinite().all())

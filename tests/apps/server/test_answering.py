@@ -215,5 +215,5 @@ def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answer
     seen, given = problem.constraints.obstacles.parts
     assert len(seen.points) == len(found.obstacles.points)
     np.testing.assert_allclose(given.points[0], made.camera.T_frame_camera[:3] @ (9.0, 0.0, 0.0, 1.0), atol=1e-6)
-    answer = ask(answerer, sent, camera=camera, choose={"at": middle}, num=1, least_confidence=0)
+    answer = ask(answerer, sent, camera=camera, choose={"at": middle}, num=1, candidates=4, least_confidence=0)
     assert answer.frame == "world"

@@ -200,7 +200,7 @@ def _planes(view: _View) -> list[_Plane]:
         if fit is None:
             break
         plane = _seen_plane(view, pool, fit)
-        if view.edge > CELL:  # cubes that are as thick as the plane come in layers, of which the fit took one
+        if view.edge > CELL:  # cubes come in layers then, of which the fit took one
             for _ in range(REFITS):
                 plane = _seen_plane(view, pool, _fit_of_points(view, plane))
         if plane.area < LEAST_AREA:
