@@ -49,7 +49,7 @@ def test_that_test_sees_switches(tmp_path: Path) -> None:
     ("give direction=(0, 0, -1), max_tilt=0.5.", "give --direction 0 0 -1, --max-tilt 0.5."),
     ("use device='cpu', or others", "use --device cpu, or others"),
     ("it is 60 m; give scale=0.001 for millimetres", "it is 60 m; give --scale 0.001 for millimetres"),
-    ("more grasps (num=...), or a place (near=(X, Y))", "more grasps (--num), or a place (--near X Y)"),
+    ("more grasps (num=...), or a place (at=(X, Y, Z))", "more grasps (--num), or a place (--at X Y Z)"),
     ("ask for that too (resettle=True)", "ask for that too (--resettle)"),
     ("choose split='train or validate'", "choose --split train or validate"),
     ("no object is called 'a/num=3'", "no object is called 'a/num=3'"),

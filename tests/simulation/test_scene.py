@@ -122,7 +122,7 @@ def test_a_scene_is_built_once_for_a_pair_and_a_protocol(hand):
     assert cached_scene(hand, ball(), protocol("strict")) is not first
     assert cached_scene(hand, ball(0.02), protocol("dro")).obj.volume < first.obj.volume
     for i in range(CACHED_SCENES):
-        cached_scene(hand, ball(), replace(protocol("dro"), friction=0.5 + i / 100))
+        cached_scene(hand, ball(), replace(protocol("dro"), friction=2.0 + i / 100))
     assert cached_scene(hand, ball(), protocol("dro")) is not first  # the oldest has gone
 
 

@@ -197,7 +197,9 @@ class _Graph:
             self._mjw.step(self._model, self._data)
         return capture.graph
 
-    def step(self, inputs: Values, fields: Fields, count: int) -> tuple[Values, Int[np.ndarray, " n"]]:
+    def step(
+        self, inputs: Values, fields: Fields, count: int
+    ) -> tuple[dict[str, Float[np.ndarray, "n *_"]], Int[np.ndarray, " n"]]:
         """State and overflows of all worlds after some steps; worlds beyond the k repeat them."""
         rows = np.resize(np.arange(len(inputs["qpos"])), self._data.nworld)
         with self._wp.ScopedDevice(self._device):
