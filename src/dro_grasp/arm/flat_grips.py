@@ -29,7 +29,8 @@ SHIFTS = (0.0, 0.015, -0.015)  # Ways along the edge from the middle of the over
 FROM_PALM = 0.008  # Distance between the palm and what is taken [m] (ours)
 PRESSES = 7.0
 """Multiple of the weight with which thumb and fingers press (ours): what is held at one end turns about the fingers."""
-LEAST_FORCE, MOST_FORCE = 8.0, 25.0  # Least and largest such force [N] (ours)
+LEAST_FORCE = 8.0  # Least such force [N] (ours)
+MOST_FORCE = 25.0  # Largest such force [N] (ours)
 GRAVITY = 9.81  # [m/s^2]
 TILTED = 0.3  # Cost of a radian between the palm and the edge (ours)
 

@@ -5,7 +5,7 @@ One call makes one motion. After a push, look again and call again. Ours.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,8 +31,6 @@ from dro_grasp.predict.predictor import GraspPredictor
 REHEARSED = 24  # Grasps at an edge whose lift is simulated (ours): one takes a tenth of a second
 UNLIKELY = 0.02
 """Height up to which grasps from above are not looked for before a push [m] (ours): round fingertips slip off such edges."""
-
-
 WIDEST = 0.09
 """Width up to which they are looked for at all [m] (ours): hands of a person's size clasp nothing flat that is wider."""
 
@@ -81,37 +79,44 @@ def plan_or_slide(
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    config, table = config or PlanConfig(), robot.table
+    config = config or PlanConfig()
 
     def usual() -> MotionPlan:
         return plan(robot, obj, T, obstacles, predictor, config, seed, start=start, place=place)
 
-    if table is None or not may_slide(robot, obj, T):
+    if not may_slide(robot, obj, T):
         return usual()
-    hand, thing = robot.hand, moved(obj, T)
-    points = np.asarray(thing.cloud, np.float64)
-
-    def trusted_alone() -> MotionPlan:
-        return _trusted(robot, thing, obstacles, predictor, config, seed, start, place)
-
-    def pushed() -> MotionPlan:
-        return slide(robot, thing, obstacles, seed=seed, start=None if start is None else robot.require_start(start))
-
-    ways = [pushed, usual]
-    if overhangs(points, table):
-        at_edge = replace(config, reach=replace(AT_TABLE, lift=config.reach.lift), rehearsals=config.rehearsals and REHEARSED)
-        grasps = flat_grasps(hand, thing, table, seed)
-        ways = [lambda: _trusted(robot, thing, obstacles, predictor, at_edge, seed, start, place, grasps), pushed,
-                lambda: plan(robot, thing, None, obstacles, predictor, at_edge, seed, grasps, start, place)]
-    elif height_of(points, table.height) > UNLIKELY and width_of(points) < WIDEST:
-        ways.insert(0, trusted_alone)
     faults = list[str]()
-    for way in ways:
+    for way in _ways(robot, moved(obj, T), obstacles, predictor, config, seed, start, place, usual):
         try:
             return way()
         except (PlanError, NoGraspError) as error:
             faults.append(str(error))
     raise PlanError("; ".join(dict.fromkeys(faults)))
+
+
+def _ways(
+    robot: Robot, obj: ObjectModel, obstacles: Sequence[ObjectModel], predictor: GraspPredictor | None, config: PlanConfig,
+    seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None, place: Sequence[float] | str | Place | None,
+    usual: Callable[[], MotionPlan],
+) -> list[Callable[[], MotionPlan]]:
+    """What is tried for a flat thing in the world, one after the other; each makes a motion, or says why it cannot."""
+    table, points = robot.table, np.asarray(obj.cloud, np.float64)
+    assert table is not None
+
+    def trusted_of(config: PlanConfig, grasps: GraspBatch | None = None) -> Callable[[], MotionPlan]:
+        return lambda: _trusted(robot, obj, obstacles, predictor, config, seed, start, place, grasps)
+
+    def pushed() -> MotionPlan:
+        return slide(robot, obj, obstacles, seed=seed, start=None if start is None else robot.require_start(start))
+
+    if overhangs(points, table):
+        at_edge = replace(config, reach=replace(AT_TABLE, lift=config.reach.lift), rehearsals=config.rehearsals and REHEARSED)
+        grasps = flat_grasps(robot.hand, obj, table, seed)
+        return [trusted_of(at_edge, grasps), pushed,
+                lambda: plan(robot, obj, None, obstacles, predictor, at_edge, seed, grasps, start, place)]
+    from_above = height_of(points, table.height) > UNLIKELY and width_of(points) < WIDEST
+    return [*([trusted_of(config)] if from_above else []), pushed, usual]
 
 
 def _trusted(

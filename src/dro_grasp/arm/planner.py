@@ -49,7 +49,8 @@ Directions = Literal["paper", "all"]  # Palm directions that are asked for
 ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
 BASE_ROOM = 0.15  # Distance of its edge from the middle of the arm's base, where that is possible [m] (ours)
 SURROUNDS = 0.1  # Least distance of its edge from what stands on it [m] (ours)
-ALIKE, ALIKE_TURN = 0.03, 0.5  # Distance [m] and angle [rad] within which a grasp is like one that failed (ours)
+ALIKE = 0.03  # Distance within which a grasp is like one that failed [m] (ours)
+ALIKE_TURN = 0.5  # Angle within which it is [rad] (ours)
 PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 

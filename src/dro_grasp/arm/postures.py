@@ -19,7 +19,9 @@ from dro_grasp.geometry.se3 import apply
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 
-AHEAD, OVER, ACROSS = range(3)
+AHEAD = 0  # Axis along the pointing fingers
+OVER = 1  # Axis from the table up
+ACROSS = 2  # Axis from finger to finger
 LOWERED = (-0.01, 0.004, 0.015, 0.03)
 """How much lower than the pointing fingers the face is that they touch [m] (ours)."""
 Cost = Callable[[Float[Tensor, "n k 3"], Bool[Tensor, " k"]], Float[Tensor, " n"]]

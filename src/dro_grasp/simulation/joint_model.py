@@ -16,6 +16,7 @@ from jaxtyping import Int, Num
 from dro_grasp.simulation.scene import FAR_AWAY, TrialScene, add_parts, compiled, touching
 
 OF_SHAPES = ("geom_dataid", "geom_pos", "geom_quat", "geom_size", "geom_aabb", "geom_rbound")
+"""Fields of MjModel that differ between the shapes of an object."""
 OF_OBJECT = ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_iquat", "body_invweight0", "dof_invweight0")
 """Fields of MjModel that differ between the scenes of a hand."""
 ABSENT = -1  # Mesh of a shape that is not there. Source: MuJoCo Warp

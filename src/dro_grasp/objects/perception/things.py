@@ -11,6 +11,7 @@ from dro_grasp.objects.perception.segmentation import CERTAIN_AREA, STRUCTURE, s
 
 MOST_TOLD = 6  # Things that a message lists (ours)
 BARE = 0.25  # Area from which a plane alone is a table without a thing on it [m^2] (ours)
+UNTOLD = 0.01  # Largest share of scattered points that is not worth a word (ours)
 LIKELY = 0.5  # Extent up to which a cloud is taken for an object without asking [m] (ours)
 AS_SCENE = ("give it as a scene, of which one thing is meant (scene=FILE camera=JSON, and nearest=True, at=(X, Y, Z) or "
             "pixel=(U, V); load_scene and object_at in Python)")  # What to do with a scene
@@ -38,7 +39,8 @@ def one_thing(
         return every, (f"it is {said}, and all of them count as one object; if it is a view, {AS_SCENE}",)
     if not on_table or not things or len(things[0]) == len(points):
         return every, ()
-    return np.sort(things[0]), (f"{len(points) - len(things[0])} scattered points beside it were left out",)
+    left = len(points) - len(things[0])
+    return np.sort(things[0]), (f"{left} scattered points beside it were left out",) if left > UNTOLD * len(points) else ()
 
 
 def refuse_scene(points: Float[np.ndarray, "n 3"], kept: Float[np.ndarray, "m 3"], origin: str) -> None:
