@@ -4,16 +4,10 @@ from ._version import __version__ as __version__
 from .apps.server.client import GraspClient as GraspClient
 from .apps.viewer.grasp_page import view_grasps as view_grasps
 from .arm.attempts import Attempt as Attempt
-from .arm.clearing import (
-    Bin as Bin,
-    ClearConfig as ClearConfig,
-    Cleared as Cleared,
-    Pick as Pick,
-    Rig as Rig,
-    clear_table as clear_table,
-)
+from .arm.clearing import Bin as Bin, ClearConfig as ClearConfig, Cleared as Cleared, Rig as Rig, clear_table as clear_table
 from .arm.flat_plans import plan_or_slide as plan_or_slide
 from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
+from .arm.picks import Pick as Pick
 from .arm.planner import PlanConfig as PlanConfig, plan as plan
 from .arm.reachability import ReachConfig as ReachConfig
 from .arm.robot import Robot as Robot, load_robot as load_robot
