@@ -170,6 +170,21 @@ def places(robot: dro.Robot, standing: Standing, wanted: object, *obstacles: dro
     return Placing(Workcell(robot, obstacles, obj, T), Place.of(wanted)).places()  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("table", "above"), [(0.01, 0.02), (None, 0.0)])
+def test_a_cloud_without_its_underside_is_put_as_high_above_a_surface_as_it_was_seen(
+    robot: dro.Robot, table: float | None, above: float
+) -> None:
+    down = np.diag([1.0, -1.0, -1.0, 1.0])  # the cloud's frame looks down
+    points = np.random.default_rng(0).uniform((-0.03, -0.03, 0.03), (0.03, 0.03, 0.1), (4000, 3))
+    seen = cloud_object("cloud", points @ down[:3, :3], origin="cloud", keep_table=True)
+    obj = replace(seen, table=None if table is None else np.array([0.0, 0.0, -1.0, table]))
+    down[:3, 3] = 0.5, 0.1, 0.0
+    found = places(robot, (obj, down), (0.4, -0.2, 0.0))
+    for motion in found.motions:
+        T = motion @ down
+        assert (obj.cloud @ T[2, :3]).min() + T[2, 3] == pytest.approx(above, abs=1e-3)
+
+
 @pytest.mark.parametrize(("spot", "message"), [
     ((0.5, 0.75, 0.0), "5.0 cm outside the table, which reaches from (-0.15, -0.70) to (1.05, 0.70) m"),
     ((0.5, -0.1, -0.03), "is 3.0 cm below the table at 0.000 m"),

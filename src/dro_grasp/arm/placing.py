@@ -19,6 +19,7 @@ from dro_grasp.arm.robot import Table
 from dro_grasp.arm.workcell import SINK, TABLE, VOXEL, Workcell
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
+from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.shape import ObjectModel
 
 AWAY = 0.15  # Least distance of a place that is chosen from where the object stood [m] (ours)
@@ -26,6 +27,8 @@ SPACING = 0.05  # Distance between the places on a table that one is chosen from
 APART = 0.03  # Distance that a place which is chosen keeps from other things [m] (ours)
 SPOTS = 4  # Places that are chosen on a table, for a grasp to reach one of (ours)
 TURNS = 8  # Turns about the vertical that are tried where none is given (ours)
+LEVEL = 0.98  # Least cosine between a table's normal and the vertical [1] (ours): 11 degrees
+FLOATS = 0.1  # Greatest height of a cloud's lowest point above what it stands on [m] (ours)
 GAP = 0.01  # Farthest that an object may stand above what carries it [m] (ours): a release from there tips most of them over
 TOP = 0.01  # Points of a thing within this depth below its highest are its top [m] (ours)
 
@@ -80,6 +83,29 @@ def foot(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], np.float64)
 
 
+def height_below(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None) -> float | None:
+    """Height of the level plane on which an object stands, below its middle in the world [m]; None without one."""
+    T = np.eye(4) if T_world_object is None else T_world_object
+    plane = None if obj.table is None else moved_plane(obj.table, T)
+    if plane is None or plane[2] < LEVEL:
+        return None
+    x, y, _ = T[:3, :3] @ obj.cloud.mean(0) + T[:3, 3]
+    return float((plane[3] - plane[0] * x - plane[1] * y) / plane[2])
+
+
+def floats(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> float:
+    """How far the lowest point of a cloud is above the plane on which it was seen [m]; 0 for a mesh.
+
+    Of what a camera sees from above, the underside is often missing: put down with the lowest point on a surface, it would be
+    pressed into it.
+    """
+    height = height_below(obj, T_world_object) if obj.vertices is None else None
+    if height is None:
+        return 0.0
+    lowest = float((obj.cloud @ T_world_object[2, :3]).min() + T_world_object[2, 3])
+    return min(max(0.0, lowest - height), FLOATS)
+
+
 def standing_turn(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3 3"]:
     """The least rotation after which a mesh stands stably on a level surface; none for a cloud, which stood as it was seen."""
     if obj.vertices is None:
@@ -109,8 +135,10 @@ class Placing:
         points = (obj.cloud if obj.vertices is None else obj.vertices).astype(np.float64)
         now = points @ T[:3, :3].T + T[:3, 3]
         self._outline = now @ stand.T  # of the object as it will stand, about the world's origin
-        self._stand, self._foot = stand, foot(self._outline)
-        self.now = foot(now)  # Where its foot is [m]
+        self._floats = floats(obj, T)
+        below = np.array([0.0, 0.0, self._floats])
+        self._stand, self._foot = stand, foot(self._outline) - below
+        self.now = foot(now) - below  # Where its foot is [m]
 
     def places(self) -> Places:
         """Where the object may be put.
@@ -146,7 +174,7 @@ class Placing:
         if not found:
             raise PlanError(f"something stands at {where}: '{self._name}' would be {100 * nearest.depth:.1f} cm deep in "
                             f"{nearest.thing}; give a place farther away from it")
-        if self._beside(self._motion(spot - (0, 0, GAP + self.place.falls), self._yaw(found[0]))).depth == 0.0:
+        if self._beside(self._motion(spot - (0, 0, GAP + self.place.falls + self._floats), self._yaw(found[0]))).depth == 0.0:
             self._refuse_air(spot, where)
         return found
 

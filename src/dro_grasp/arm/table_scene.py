@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.arm.flat_things import overhang, seen_flat
+from dro_grasp.arm.placing import LEVEL
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.workcell import VOXEL
 from dro_grasp.errors import ObjectError, RobotError
@@ -18,7 +19,6 @@ from dro_grasp.objects.perception.choosing import Pixel, Spot, within
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
-LEVEL = 0.98  # Least cosine between a table's normal and the vertical [1] (ours): 11 degrees
 OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
 BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
 

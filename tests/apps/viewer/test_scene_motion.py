@@ -16,12 +16,12 @@ import torch
 import dro_grasp as dro
 from dro_grasp.apps.viewer import scene_motion
 from dro_grasp.apps.viewer.film import Film
-from dro_grasp.apps.viewer.scene_motion import RobotScenePage, height_below, levelled, place_of_cloud, surroundings
+from dro_grasp.apps.viewer.scene_motion import RobotScenePage, levelled, surroundings
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, MotionPlan, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.placing import height_below
 from dro_grasp.arm.reachability import Fault
 from dro_grasp.errors import OptionError, PlanError
-from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import Scene
 from tests.helpers.browser import free_port
@@ -200,12 +200,3 @@ def test_a_thing_on_another_surface_has_that_one_as_an_obstacle(scene: Scene, ro
     assert table is not None
     assert table.height == pytest.approx(0.02)
     assert (table.centre, table.size) == (robot.table.centre, robot.table.size)
-
-
-def test_a_thing_without_its_underside_is_let_go_as_high_as_it_was_seen_to_float() -> None:
-    points = box((0, 0, 0.03), (0.05, 0.05, 0.1))
-    obj = replace(cloud_object("cloud", points, origin="cloud", keep_table=True), table=np.array([0.0, 0.0, 1.0, 0.01]))
-    place = place_of_cloud((0.4, 0.1, 0.01, 0.5), obj)
-    assert place.spot == pytest.approx((0.4, 0.1, 0.03), abs=0.001)
-    assert (place.yaw, place.falls) == (0.5, pytest.approx(0.02, abs=0.001))
-    assert place_of_cloud((0.4, 0.1, 0.0), replace(obj, table=None)).falls == 0.0

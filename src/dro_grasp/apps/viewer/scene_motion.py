@@ -19,7 +19,7 @@ from dro_grasp.apps.viewer.scene_page import STRUCTURE_THERE, Offer, ScenePage, 
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
 from dro_grasp.arm.animation import VIEW
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.placing import Place, foot
+from dro_grasp.arm.placing import Place, foot, height_below
 from dro_grasp.arm.planner import PlanConfig, Task, plan, predicted
 from dro_grasp.arm.robot import Robot
 from dro_grasp.errors import OptionError, PlanError
@@ -34,10 +34,8 @@ from dro_grasp.predict.predictor import GraspPredictor
 
 PLACE_COLOUR: Colour = (0.30, 0.65, 0.42)  # Green of where the thing will stand
 NEAR = 0.15  # Margin of the thing in the view of its grasps [m] (ours)
-LEVEL = 0.98  # Least cosine to the vertical of the plane that is the robot's table [1] (ours)
 TABLE_WITHIN = 0.05  # Farthest that the plane below a thing may be from the robot's table to be it [m] (ours)
 SEEDS = 4  # How often the motion of one grasp is tried (ours)
-FLOATS = 0.1  # Greatest height of a cloud's lowest point above what it stands on [m] (ours)
 ON_PLANE = 0.02  # Points nearer to a plane than this are its own [m] (ours)
 
 
@@ -187,7 +185,7 @@ class RobotScenePage(ScenePage):
         return Offer(wish, found, grasps[order], tuple(faults[i] for i in order), shortage)
 
     def _task(self, wish: Wish, found: FoundObject, spot: tuple[float, ...] | None) -> Task:
-        place = None if spot is None else place_of_cloud(spot, found.obj)
+        place = None if spot is None else Place.of(spot)
         return Task.of(levelled(self.robot, found.obj), found.obj, np.eye(4), (), self._config(wish, found), wish.seed,
                        place=place)
 
@@ -311,26 +309,6 @@ def levelled(robot: Robot, obj: ObjectModel) -> Robot:
     if robot.table is None or height is None or abs(height - robot.table.height) > TABLE_WITHIN:
         return robot
     return replace(robot, table=replace(robot.table, height=height))
-
-
-def place_of_cloud(spot: tuple[float, ...], obj: ObjectModel) -> Place:
-    """A place on a surface [m], where a cloud is let go as high above it as its lowest point is above what it stands on now.
-
-    Of what a camera sees from above, the underside is often missing: put down with that point on the surface, it would be
-    pressed into it.
-    """
-    x, y, z, *turn = spot
-    height = height_below(obj)
-    gap = 0.0 if height is None else min(max(0.0, float(obj.cloud[:, 2].min()) - height), FLOATS)
-    return Place((x, y, z + gap), turn[0] if turn else None, falls=gap)
-
-
-def height_below(obj: ObjectModel) -> float | None:
-    """Height of the level plane on which an object stands, below its middle [m]; None without one."""
-    if obj.table is None or obj.table[2] < LEVEL:
-        return None
-    x, y = obj.cloud[:, :2].mean(0)
-    return float((obj.table[3] - obj.table[0] * x - obj.table[1] * y) / obj.table[2])
 
 
 def surroundings(scene: Scene, found: FoundObject, robot: Robot) -> Scene | None:
