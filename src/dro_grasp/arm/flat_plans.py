@@ -16,7 +16,7 @@ from dro_grasp.arm.flat_grips import flat_grasps, overhangs
 from dro_grasp.arm.flat_things import height_of, lies_flat, width_of
 from dro_grasp.arm.motion import MotionPlan, grasps_and_dropped
 from dro_grasp.arm.placing import Place
-from dro_grasp.arm.planner import PlanConfig, Task, Tries, add, candidates, motion, plan, reachable, rehearsed, trusted
+from dro_grasp.arm.planner import PlanConfig, Task, Tries, first_trusted, plan
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.sliding import AT_TABLE, slide
 from dro_grasp.arm.workcell import moved
@@ -130,12 +130,9 @@ def _trusted(
         PlanError: There is none.
     """
     wanted = place if place is None or isinstance(place, Place) else Place.of(place)
-    task, tries = Task.of(robot, obj, np.eye(4), obstacles, config, seed, start, wanted), Tries()
+    task, tries = Task.of(robot, obj, np.eye(4), obstacles, replace(config, batches=1), seed, start, wanted), Tries()
     task.check_start()
-    batch, _ = next(candidates(task, tries, grasps, predictor))
-    add(task, tries, batch)
-    goals = rehearsed(task, tries, reachable(task, tries))
-    made = motion(task, tries, goals, seed) if goals and trusted(task, tries, goals[0].index) else None
+    made = first_trusted(task, tries, grasps, predictor)
     if made is None:
-        raise PlanError(f"no grasp of '{obj.name}' is trusted: {grasps_and_dropped(len(tries.grasps), tries.counts)}")
+        raise PlanError(f"no grasp of '{obj.name}' is trusted: {grasps_and_dropped(tries.made, tries.counts)}")
     return made

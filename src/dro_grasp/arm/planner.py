@@ -58,8 +58,8 @@ PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right s
 class PlanConfig(Checked):
     """How a motion is planned. Values without a source are ours."""
 
-    num: int = 24
-    """Grasps to choose from, in each of the batches."""
+    num: int = 8
+    """Grasps that are asked for, in each of the batches. Each is tried as soon as it is known."""
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
     directions: Directions = "all"
@@ -71,7 +71,7 @@ class PlanConfig(Checked):
     rounds: int = 3
     """Largest number of times that the planner is asked, each time with the next `top` grasps."""
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated, on the object as it is known; 0 for none."""
+    """Grasps whose lift is simulated, on the object as it is known, whenever there are new ones; 0 for none."""
     friction: float = FRICTION
     """Coefficient of friction between hand, object and table, for rehearsals."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
@@ -82,8 +82,8 @@ class PlanConfig(Checked):
     """Log-odds of holding that this grasp should have, where nothing is rehearsed."""
     batches: int = 3
     """Largest number of batches. Another is made while no grasp is trusted, or none works."""
-    candidates: int = 1
-    """Candidates for each grasp, as in `GraspRequest`: which of them can be reached decides more than the best scores."""
+    candidates: int = 3
+    """Candidates for each grasp, as in `GraspRequest`."""
     source: str | Source = AUTO
     """What proposes grasps, as in `GraspRequest`."""
     least_confidence: float | None = None
@@ -157,19 +157,11 @@ def plan(
     task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted, avoid)
     task.check_start()
     tries = Tries()
-    for batch, last in candidates(task, tries, grasps, predictor):
-        add(task, tries, batch)
-        for attempt in range(task.config.rounds):
-            goals = rehearsed(task, tries, reachable(task, tries))
-            if last and not goals:
-                goals = best_lost(task, tries)
-            if not goals or not (last or trusted(task, tries, goals[0].index)):
-                tries.ready = goals
-                break
-            if (made := motion(task, tries, goals, seed + attempt)) is not None:
-                return made
-    raise PlanError(tries.shortage if tries.shortage and not len(tries.grasps) else (
-        f"{grasps_and_dropped(len(tries.grasps), tries.counts)}, and none is left for '{obj.name}'; "
+    made = first_trusted(task, tries, grasps, predictor) or first_possible(task, tries)
+    if made is not None:
+        return made
+    raise PlanError(tries.shortage if tries.shortage and not tries.made else (
+        f"{grasps_and_dropped(tries.made, tries.counts)}, and none is left for '{obj.name}'; "
         f"{task.advice(tries.counts)}"))
 
 
@@ -298,31 +290,81 @@ class Tries:
         """All that were made."""
         return GraspBatch.concatenate(self.parts)
 
+    def wait(self, task: Task) -> None:
+        """Let what is left over wait again, in the order of trying."""
+        self.waiting += [goal.index for goal in self.taken()]
+        if task.config.order == "random":
+            np.random.default_rng(task.seed).shuffle(self.waiting)
+        else:
+            score = self.grasps.score.tolist()
+            self.waiting.sort(key=lambda i: -score[i])
+
+    def taken(self) -> list[Feasible]:
+        """What is left over, which it is no longer."""
+        taken, self.ready = self.ready, []
+        return taken
+
+    @property
+    def made(self) -> int:
+        """How many there are."""
+        return sum(len(part) for part in self.parts)
+
     @property
     def counts(self) -> dict[str, int]:
         """How many grasps were dropped, by reason."""
         return dict(Counter(self.dropped.values()))
 
 
+def first_trusted(
+    task: Task, tries: Tries, given: GraspBatch | Callable[[int], GraspBatch] | None, predictor: GraspPredictor | None
+) -> MotionPlan | None:
+    """The motion to a grasp that is trusted, as soon as one is known; None if the configuration allows no more grasps."""
+    for grasps in candidates(task, tries, given, predictor):
+        add(task, tries, grasps)
+        for attempt in range(task.config.rounds):
+            tries.ready = rehearsed(task, tries, reachable(task, tries))
+            if not tries.ready or not trusted(task, tries, tries.ready[0].index):
+                break
+            if (made := motion(task, tries, tries.taken(), task.seed + attempt)) is not None:
+                return made
+    return None
+
+
+def first_possible(task: Task, tries: Tries) -> MotionPlan | None:
+    """The motion to the best grasp that can be carried out, once no other will come; None if there is none."""
+    for attempt in range(task.config.rounds if tries.made else 0):
+        tries.wait(task)
+        goals = rehearsed(task, tries, reachable(task, tries)) or best_lost(task, tries)
+        if not goals:
+            break
+        if (made := motion(task, tries, goals, task.seed + attempt)) is not None:
+            return made
+    return None
+
+
 def candidates(
     task: Task, tries: Tries, given: GraspBatch | Callable[[int], GraspBatch] | None, predictor: GraspPredictor | None
-) -> Iterator[tuple[GraspBatch, bool]]:
-    """Batch after batch of grasps in the world's frame, as many as the configuration allows, and whether each is the last."""
+) -> Iterator[GraspBatch]:
+    """Grasps in the world's frame as they become known, of as many batches as the configuration allows."""
     if isinstance(given, GraspBatch):
-        yield given, True
+        yield given
         return
-    make = given or predicted(task, predictor or GraspPredictor())
+    make = predicted(task, predictor or GraspPredictor()) if given is None else lambda seed: iter([given(seed)])
     for batch in range(task.config.batches):
-        with tries.watch("grasps"):
-            try:
-                made = make(task.seed + 7919 * batch)  # far from the seeds of other plans
-            except NoGraspError as error:  # another seed may find some
-                made, tries.shortage = GraspBatch.none(task.robot.hand, task.obj), str(error)
-        yield made, batch + 1 == task.config.batches
+        coming = make(task.seed + 7919 * batch)  # far from the seeds of other plans
+        while True:
+            with tries.watch("grasps"):
+                try:
+                    grasps = next(coming, None)
+                except NoGraspError as error:  # another seed may find some
+                    grasps, tries.shortage = None, str(error)
+            if grasps is None:
+                break
+            yield grasps
 
 
-def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
-    """What makes grasps in the world's frame from a seed."""
+def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator[GraspBatch]]:
+    """What makes grasps in the world's frame from a seed, as they become known."""
     directions: Directions | Float[Tensor, "k 3"] = task.config.directions
     if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
         middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
@@ -330,15 +372,23 @@ def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBat
     clouds = [thing.cloud for thing in task.cell.obstacles]
     wanted = replace(
         task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
-    return lambda seed: grasps_in_world(
-        predictor, task.robot.hand, task.obj, task.T,
-        GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source,
-                     least_confidence=task.config.least_confidence), wanted, directions)
+    config, hand, obj, T = task.config, task.robot.hand, task.obj, task.T
+
+    def coming(seed: int) -> Iterator[GraspBatch]:
+        request = GraspRequest(
+            config.num, seed, config.candidates, source=config.source, least_confidence=config.least_confidence)
+        if isinstance(directions, str) and directions == "all":
+            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)))
+            yield from (in_world(grasps, T) for grasps in predictor.rounds(problem, request))
+        else:
+            yield grasps_in_world(predictor, hand, obj, T, request, wanted, directions)
+
+    return coming
 
 
 def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     """Let further grasps wait in order, but those that do not respect the constraints or are hopeless."""
-    first = sum(len(part) for part in tries.parts)
+    first = tries.made
     tries.parts.append(grasps)
     with tries.watch("reach"):
         if task.constraints != Constraints():  # table and obstacles are the arm's affair
@@ -351,13 +401,7 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
         for row in failed_before(grasps, task.avoid):
             tries.dropped.setdefault(first + row, Fault.FAILED)
     tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
-    tries.waiting += [goal.index for goal in tries.ready]
-    tries.ready = []
-    if task.config.order == "random":
-        np.random.default_rng(task.seed).shuffle(tries.waiting)
-    else:
-        score = tries.grasps.score.tolist()
-        tries.waiting.sort(key=lambda i: -score[i])
+    tries.wait(task)
 
 
 def failed_before(grasps: GraspBatch, avoid: Sequence[Float[np.ndarray, "4 4"]]) -> list[int]:
@@ -537,6 +581,11 @@ def grasps_in_world(
     found = [part for part in parts if isinstance(part, GraspBatch)]
     if not found:
         raise next(part for part in parts if isinstance(part, NoGraspError))
-    ranked = GraspBatch.concatenate(found).sorted_by_score()
-    further = {name: column for name, column in ranked.extra.items() if name != TABLE}  # which is of the frame left behind
-    return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist, extra=further)
+    return in_world(GraspBatch.concatenate(found).sorted_by_score(), T_world_object)
+
+
+def in_world(grasps: GraspBatch, T_world_object: Float[np.ndarray, "4 4"]) -> GraspBatch:
+    """Grasps of an object that stands here [m]."""
+    further = {name: column for name, column in grasps.extra.items() if name != TABLE}  # which is of the frame left behind
+    T = torch.from_numpy(T_world_object).float()
+    return grasps.replace(T_object_wrist=T @ grasps.T_object_wrist, extra=further)

@@ -38,7 +38,7 @@ class Clear:
         tuple[float, float, float, float, float] | None, optional("X Y LX LY HEIGHT", "0.3 0.5 0.36 0.3 0.08")] = None
     """Middle and extents of the bin, and the height of its walls, in the world [m]."""
     tries: int = 3  # Picks of a thing that may fail before it is given up.
-    num: int = 24  # Grasps to choose from, in each of up to three batches.
+    num: int = 8  # Grasps that are asked for, in each of up to three batches; each is tried as soon as it is known.
     rehearsals: int = 8  # Grasps of each batch whose lift is simulated on the object as it is known; 0 for none.
     friction: Friction = 0.5
     seed: int = 0  # Seed of all draws.

@@ -75,10 +75,10 @@ class Plan:
     trusted: look again after it, and plan again."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)  # In the world frame.
     mass: Mass = None  # Mass of the object [kg], which the grasp shall carry.
-    num: int = 24  # Grasps to choose from, in each of up to three batches.
+    num: int = 8  # Grasps that are asked for, in each of up to three batches; each is tried as soon as it is known.
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
-    """Grasps of each batch whose lift is simulated before one is chosen, on the object as it is known; 0 for none."""
+    """Grasps whose lift is simulated, on the object as it is known, whenever there are new ones; 0 for none."""
     friction: Annotated[float, tyro.conf.arg(metavar="MU")] = 0.5
     """Friction between hand, object and table, in simulated lifts."""
     directions: Literal["paper", "all"] = "all"
@@ -261,7 +261,7 @@ class Tabletop:
     2 cm and 15 degrees, upright."""
     no_slide: Flag = False  # Do not push what lies flat to an edge of the table where no grasp of it is trusted.
     mass: Mass = None  # Mass of each object to lift [kg], which its grasps shall carry.
-    num: int = 24  # Grasps to choose from, in each of up to three batches.
+    num: int = 8  # Grasps that are asked for, in each of up to three batches; each is tried as soon as it is known.
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
     friction: Friction = 0.5

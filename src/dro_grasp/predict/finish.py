@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -100,8 +100,18 @@ class Finished:
     @cached_property
     def rows(self) -> Int[Tensor, " k"]:
         """Rows of the best in the pool, the best score first, without those that are not trusted enough."""
-        best = (-self.pool.score).argsort(stable=True)[: self.keep]
+        return self.best(torch.ones_like(self.trusted))
+
+    def best(self, allowed: Bool[Tensor, " n"]) -> Int[Tensor, " k"]:
+        """The same of these rows alone; others may be of any score."""
+        rows = allowed.nonzero()[:, 0]
+        best = rows[(-self.pool.score[rows]).argsort(stable=True)[: self.keep]]
         return best[self.trusted[best]]
+
+    def among(self, rows: Int[Tensor, " k"]) -> Finished:
+        """As if these rows were all of the pool."""
+        return replace(self, pool=self.pool[rows], candidates=self.candidates[rows],
+                       doubts=tuple(self.doubts[row] for row in rows.tolist()))
 
     @cached_property
     def trusted(self) -> Bool[Tensor, " n"]:

@@ -215,12 +215,7 @@ class GraspPredictor:
         Raises:
             OptionError: There is no such source, or it does not know the hand.
         """
-        config = self.config.finish
-        if not request.refine:
-            config = replace(config, refine=None, settle=None, ease=None, least_confidence=0.0)
-        if request.least_confidence is not None:
-            config = replace(config, least_confidence=request.least_confidence)
-        under_way = [_Asking(self, problem, request, config) for problem in problems]
+        under_way = [_Asking(self, problem, request) for problem in problems]
         rounds = {asking: asking.rounds(*self._roles(asking.problem, request)) for asking in under_way}
         while rounds:
             now = {asking: ask for asking, turns in rounds.items() if (ask := next(turns, None)) is not None}
@@ -229,6 +224,28 @@ class GraspPredictor:
                 _take(together, [now[asking] for asking in together], progress)
         complete_grasps([asking.done for asking in under_way if asking.done is not None and len(asking.done.rows)])
         return [asking.result() for asking in under_way]
+
+    @torch.no_grad()
+    def rounds(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Iterator[GraspBatch]:
+        """Grasps as they become known: after each round in which sources were asked, what is new and would be returned so far.
+
+        For those who need one good grasp soon and know by themselves which is: who has it asks for no further round. Arguments
+        and errors are those of `run`; where nothing is found at all, no batch comes before the error.
+
+        Yields:
+            Complete grasps with scores, the best score first; as many as were asked for at most.
+        """
+        asking, shown = _Asking(self, problem, request), torch.zeros(0, dtype=torch.bool)
+        for wanted in asking.rounds(*self._roles(problem, request)):
+            _take([asking], [wanted], progress)
+            done = asking.done
+            assert done is not None
+            shown = torch.cat([shown, shown.new_zeros(len(done.pool) - len(shown))])
+            if len(rows := done.best(~shown)):
+                shown[rows] = True
+                yield with_own_files(done.among(rows).grasps, problem.hand, problem.obj)
+        if not shown.any():
+            raise NoGraspError(str(asking.shortage))
 
     def source(self, name: str | Source, temperature: float | None = None) -> Source:
         """A source by its name, with the predictor's weights and configuration where it has any.
@@ -270,11 +287,9 @@ class _Ask(NamedTuple):
 class _Asking:
     """One request under way: what was finished so far."""
 
-    def __init__(
-        self, predictor: GraspPredictor, problem: GraspProblem, request: GraspRequest, config: FinishConfig
-    ) -> None:
+    def __init__(self, predictor: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> None:
         self.config, self.n_points = predictor.config, predictor.network.config.n_hand
-        self.problem, self.request, self.finishing = problem, request, config
+        self.problem, self.request, self.finishing = problem, request, _finishing(self.config.finish, request)
         self.done: Finished | None = None
         self.alone = False
         rescue = self.config.rescue
@@ -302,16 +317,21 @@ class _Asking:
 
     def result(self) -> Prediction | NoGraspError:
         """What is returned."""
-        done, request, shortage = self.done, self.request, None
-        if done is None or len(done.rows) < request.num:
-            shortage = shortage_in_words(self.problem, request.num, done, self.alone)
+        done, request = self.done, self.request
         if done is None or not len(done.rows):
-            return NoGraspError(str(shortage))
+            return NoGraspError(str(self.shortage))
         proposed = done.proposed
         given, before = (grasps.with_asked(request.num) for grasps in (
             with_own_files(done.grasps, self.problem.hand, self.problem.obj), complete(self.problem, proposed.grasps)))
         return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped),
-                          self.seconds | done.watch.seconds, shortage)
+                          self.seconds | done.watch.seconds, self.shortage)
+
+    @property
+    def shortage(self) -> str | None:
+        """Why there are fewer grasps so far than were asked for; None if there are as many."""
+        if self.done is not None and len(self.done.rows) == self.request.num:
+            return None
+        return shortage_in_words(self.problem, self.request.num, self.done, self.alone)
 
     def until_enough(self, source: Source) -> Iterator[_Ask]:
         """Candidates until enough are trusted, or as many as were asked for are admitted, as long as that is in sight."""
@@ -408,6 +428,13 @@ def _take(asking: Sequence[_Asking], asks: Sequence[_Ask], progress: Progress | 
     finished = finish_all(problems, made, first.finishing, first.request.num, [each.done for each in asking])
     for each, done, own in zip(asking, finished, made, strict=True):
         each.take(done, own)
+
+
+def _finishing(config: FinishConfig, request: GraspRequest) -> FinishConfig:
+    """What becomes of candidates, as the request wants it."""
+    if not request.refine:
+        config = replace(config, refine=None, settle=None, ease=None, least_confidence=0.0)
+    return config if request.least_confidence is None else replace(config, least_confidence=request.least_confidence)
 
 
 def _drawn(first: int, count: int) -> list[int]:

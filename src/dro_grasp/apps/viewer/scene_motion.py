@@ -166,7 +166,7 @@ class RobotScenePage(ScenePage):
         """Grasps as the planner makes them, those first that the arm can carry out."""
         task = self._task(wish, found, None)
         task.check_start()
-        grasps = predicted(task, self.predictor)(wish.seed)
+        grasps = GraspBatch.concatenate([*predicted(task, self.predictor)(wish.seed)]).sorted_by_score()
         self._still(wish)
         self._say(f"**Thing {wish.number + 1}**: which of {len(grasps)} grasps the arm can carry out ...")
         return self._ranked(wish, found, grasps, None, lifted=True)
@@ -239,7 +239,7 @@ class RobotScenePage(ScenePage):
 
         def batch(seed: int) -> GraspBatch:
             self._still(offer.wish)
-            return next(batches, None) or further(seed)
+            return next(batches, None) or GraspBatch.concatenate([*further(seed)])
 
         return plan(task.robot, offer.found.obj, predictor=self.predictor, config=task.config, seed=offer.wish.seed,
                     grasps=batch, place=task.place)
