@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -148,6 +149,10 @@ class Listener(dro.GraspPredictor):
     def run(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Prediction:
         self.asked.append(request.least_confidence)
         raise NoGraspError("nothing is made")
+
+    def rounds(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Iterator[dro.GraspBatch]:
+        self.run(problem, request)
+        yield from ()
 
 
 @pytest.mark.parametrize(("directions", "each"), [("all", 1), ("paper", 2)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,11 +73,11 @@ def test_a_plan_touches_nothing_at_ten_times_its_resolution(
 def test_a_plan_has_the_forces_of_its_grasp(robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]) -> None:
     """Which the predictor states for each grasp; here its joints tell whose they are."""
     class Pressing(dro.GraspPredictor):
-        def run(self, *arguments: Any) -> Any:
-            made = super().run(*arguments)
-            joints = made.grasps.joints
-            return replace(made, grasps=made.grasps.replace(
-                squeeze_torque=0.01 * joints, payload=joints.abs().sum(1), squeeze_force=torch.full((len(joints),), 6.25)))
+        def rounds(self, *arguments: Any) -> Iterator[dro.GraspBatch]:
+            for made in super().rounds(*arguments):
+                joints = made.joints
+                yield made.replace(
+                    squeeze_torque=0.01 * joints, payload=joints.abs().sum(1), squeeze_force=torch.full((len(joints),), 6.25))
 
     made = plan(robot, *standing, predictor=Pressing(), config=PlanConfig(num=12), seed=0)
     joints = made.scene.joints[made.notes.chosen]
