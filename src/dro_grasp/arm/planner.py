@@ -76,10 +76,12 @@ class PlanConfig(Checked):
     """Coefficient of friction between hand, object and table, for rehearsals."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
     """How the rehearsals of one grasp deviate from what is known."""
+    sure_score: float = 0.0
+    """Log-odds of holding from which on a grasp that holds in all of its rehearsals is taken at once."""
     trusted_share: float = 0.5
-    """Share of its rehearsals in which the best grasp that can be carried out should hold the object."""
+    """Share of its rehearsals in which the best grasp of a whole batch should hold the object."""
     trusted_score: float = 1.0
-    """Log-odds of holding that this grasp should have, where nothing is rehearsed."""
+    """Log-odds of holding that a grasp should have, where nothing is rehearsed."""
     batches: int = 3
     """Largest number of batches. Another is made while no grasp is trusted, or none works."""
     candidates: int = 3
@@ -320,12 +322,14 @@ def first_trusted(
 ) -> MotionPlan | None:
     """The motion to a grasp that is trusted, as soon as one is known; None if the configuration allows no more grasps."""
     for grasps in candidates(task, tries, given, predictor):
-        add(task, tries, grasps)
-        for attempt in range(task.config.rounds):
+        if grasps is not None:
+            add(task, tries, grasps)
+        for attempt in range(task.config.rounds if tries.made else 0):
+            tries.wait(task)
             tries.ready = rehearsed(task, tries, reachable(task, tries))
-            if not tries.ready or not trusted(task, tries, tries.ready[0].index):
+            if not (goals := trusted(task, tries, whole=grasps is None)):
                 break
-            if (made := motion(task, tries, tries.taken(), task.seed + attempt)) is not None:
+            if (made := motion(task, tries, goals, task.seed + attempt)) is not None:
                 return made
     return None
 
@@ -344,10 +348,10 @@ def first_possible(task: Task, tries: Tries) -> MotionPlan | None:
 
 def candidates(
     task: Task, tries: Tries, given: GraspBatch | Callable[[int], GraspBatch] | None, predictor: GraspPredictor | None
-) -> Iterator[GraspBatch]:
-    """Grasps in the world's frame as they become known, of as many batches as the configuration allows."""
+) -> Iterator[GraspBatch | None]:
+    """Grasps in the world's frame as they become known, and None at the end of each batch that the configuration allows."""
     if isinstance(given, GraspBatch):
-        yield given
+        yield from (given, None)
         return
     make = predicted(task, predictor or GraspPredictor()) if given is None else lambda seed: iter([given(seed)])
     for batch in range(task.config.batches):
@@ -358,9 +362,9 @@ def candidates(
                     grasps = next(coming, None)
                 except NoGraspError as error:  # another seed may find some
                     grasps, tries.shortage = None, str(error)
+            yield grasps
             if grasps is None:
                 break
-            yield grasps
 
 
 def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator[GraspBatch]]:
@@ -401,7 +405,6 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
         for row in failed_before(grasps, task.avoid):
             tries.dropped.setdefault(first + row, Fault.FAILED)
     tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
-    tries.wait(task)
 
 
 def failed_before(grasps: GraspBatch, avoid: Sequence[Float[np.ndarray, "4 4"]]) -> list[int]:
@@ -461,11 +464,21 @@ def best_lost(task: Task, tries: Tries) -> list[Feasible]:
     return goals
 
 
-def trusted(task: Task, tries: Tries, best: int) -> bool:
-    """Whether no further grasps are needed."""
-    if task.rehearsal is not None:
-        return tries.share[best] >= task.config.trusted_share
-    return task.config.order == "random" or float(tries.grasps.score[best]) >= task.config.trusted_score
+def trusted(task: Task, tries: Tries, whole: bool) -> list[Feasible]:
+    """Goals for whose sake no further grasps are needed, within a batch or after the whole of it, taken from what is left."""
+    config, score = task.config, tries.grasps.score.tolist()
+
+    def enough(number: int) -> bool:
+        if task.rehearsal is None:
+            return config.order == "random" or score[number] >= config.trusted_score
+        least, surely = (config.trusted_share, -math.inf) if whole else (1.0, config.sure_score)
+        return tries.share[number] >= least and score[number] >= surely
+
+    ready = tries.taken()
+    # After a whole batch the best decides for all that can be reached, any of which a path may lead to.
+    goals = ready if whole and ready and enough(ready[0].index) else [goal for goal in ready if enough(goal.index)]
+    tries.ready = [goal for goal in ready if not any(goal is taken for taken in goals)]
+    return goals
 
 
 def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> MotionPlan | None:
