@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from dro_grasp.arm.attempts import Attempt, endings, failures, lifted, processor_seconds
-from dro_grasp.arm.planner import PlanConfig
 from dro_grasp.arm.reachability import Fault
 from dro_grasp.arm.robot import load_robot
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import upright
 from dro_grasp.compare.methods import mean_grasps_of
 from dro_grasp.compare.metrics import wilson_interval

@@ -8,13 +8,14 @@ from .arm.clearing import Bin as Bin, ClearConfig as ClearConfig, Cleared as Cle
 from .arm.flat_plans import plan_or_slide as plan_or_slide
 from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
 from .arm.picks import Pick as Pick
-from .arm.planner import PlanConfig as PlanConfig, plan as plan
+from .arm.planner import plan as plan
 from .arm.reachability import ReachConfig as ReachConfig
 from .arm.robot import Robot as Robot, load_robot as load_robot
 from .arm.robot_check import RobotReport as RobotReport, check_robot as check_robot
 from .arm.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from .arm.tabletop import TabletopConfig as TabletopConfig
 from .arm.tabletop_run import TabletopRun as TabletopRun, run_tabletop as run_tabletop
+from .arm.task import PlanConfig as PlanConfig
 from .arm.task_stages import task_stages as task_stages, task_yaml as task_yaml
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval

@@ -9,7 +9,8 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.planner import plan
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import ARM
 
 PLACE = (0.5, 0.1)

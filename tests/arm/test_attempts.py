@@ -17,10 +17,10 @@ from dro_grasp.arm import tabletop
 from dro_grasp.arm.animation import Recorder, draw_animation
 from dro_grasp.arm.camera_view import STRIDE, depth_image, thinned_intrinsics
 from dro_grasp.arm.physics import Deviation, LiftScene, object_name
-from dro_grasp.arm.planner import PlanConfig
 from dro_grasp.arm.table_scene import PickedObject, pick_object
 from dro_grasp.arm.table_setup import APART, other_objects, rest, scatter
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
 from dro_grasp.objects.perception.scan import depth_points

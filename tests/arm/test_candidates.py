@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.arm.planner import grasps_in_world, paper_directions
+from dro_grasp.arm.candidates import grasps_in_world, paper_directions
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig

@@ -12,11 +12,13 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
+from dro_grasp.arm.candidates import grasps_in_world
 from dro_grasp.arm.clearing_trial import ClearTrialConfig
 from dro_grasp.arm.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
-from dro_grasp.arm.planner import PlanConfig, grasps_in_world, plan
+from dro_grasp.arm.planner import plan
 from dro_grasp.arm.reachability import Fault, Feasible, Postures
 from dro_grasp.arm.tabletop import TabletopConfig
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.shape import solid_of

@@ -22,10 +22,11 @@ from dro_grasp.arm.motion import ALL_STAGES, PLACING, STAGES, MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.placed import draw_place, measured, place_fault
 from dro_grasp.arm.placing import AWAY, SPOTS, TURNS, Place, Placing, foot, off_table, standing_turn
-from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.planner import plan
 from dro_grasp.arm.reachability import Fault, Places, Put, Reachability, ReachConfig
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import CARRIED, Workcell, arm_addresses, robot_spec
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.objects.loading import cloud_object

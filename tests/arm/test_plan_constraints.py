@@ -17,8 +17,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
+from dro_grasp.arm.candidates import grasps_in_world
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.planner import grasps_in_world, plan
+from dro_grasp.arm.planner import plan
 from dro_grasp.arm.tabletop import TabletopConfig
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.errors import NoGraspError, OptionError

@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 import dro_grasp as dro
 import dro_grasp.arm.robot as dro_robot
 from dro_grasp.arm.motion import STAGES, MotionPlan
-from dro_grasp.arm.planner import ALIKE, ALIKE_TURN, PlanConfig, Task, failed_before, plan
+from dro_grasp.arm.planner import ALIKE, ALIKE_TURN, failed_before, plan
 from dro_grasp.arm.robot import BUILTIN_ROBOTS
+from dro_grasp.arm.task import PlanConfig, Task
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError, RobotError

@@ -12,9 +12,9 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.arm import tabletop_run
 from dro_grasp.arm.attempts import Attempt, endings, failures, read_attempts, write_attempts
-from dro_grasp.arm.planner import PlanConfig
 from dro_grasp.arm.tabletop import TabletopConfig
 from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.network.checkpoints import DEFAULT, load_weights, save_weights

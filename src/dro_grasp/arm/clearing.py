@@ -17,9 +17,10 @@ from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.parts import parted
 from dro_grasp.arm.picks import Memory, Outcome, Pick
 from dro_grasp.arm.placing import Place
-from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.planner import plan
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.table_scene import PickedObject, pick_object, seen_on_table
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.trajectory import find_path, smooth, standing, still
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError

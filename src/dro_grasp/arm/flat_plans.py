@@ -16,9 +16,10 @@ from dro_grasp.arm.flat_grips import flat_grasps, overhangs
 from dro_grasp.arm.flat_things import height_of, lies_flat, width_of
 from dro_grasp.arm.motion import MotionPlan, grasps_and_dropped
 from dro_grasp.arm.placing import Place
-from dro_grasp.arm.planner import PlanConfig, Task, Tries, first_trusted, plan
+from dro_grasp.arm.planner import Tries, first_trusted, plan
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.sliding import AT_TABLE, slide
+from dro_grasp.arm.task import PlanConfig, Task
 from dro_grasp.arm.workcell import moved
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra

@@ -8,115 +8,37 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
+from dro_grasp.arm.candidates import predicted
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
-from dro_grasp.arm.physics import DEVIATIONS, FRICTION, Deviation, Rehearsal, check_friction
-from dro_grasp.arm.placing import Place, Places, Placing
-from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, carried, reachable_directions
-from dro_grasp.arm.robot import Robot, Table
+from dro_grasp.arm.placing import Place
+from dro_grasp.arm.reachability import Fault, Feasible, Postures, carried
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.task import PlanConfig, Task
 from dro_grasp.arm.trajectory import find_path, timed_stages
-from dro_grasp.arm.workcell import CARRIED, OBSTACLE, Workcell, moved, scene_solid, upright
-from dro_grasp.devices import Stopwatch, side_by_side
+from dro_grasp.arm.workcell import CARRIED
+from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import TABLE
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
 from dro_grasp.grasps.hold import HOLD_COLUMNS
-from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked, checked
-from dro_grasp.objects.scenery import load_scene
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, violations
-from dro_grasp.predict.config import AUTO, GraspRequest
+from dro_grasp.predict.admission import violations
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.source import Source
 from dro_grasp.simulation.holding import expect_hold
 
-Directions = Literal["paper", "all"]  # Palm directions that are asked for
-ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
-BASE_ROOM = 0.15  # Distance of its edge from the middle of the arm's base, where that is possible [m] (ours)
-SURROUNDS = 0.1  # Least distance of its edge from what stands on it [m] (ours)
 ALIKE = 0.03  # Distance within which a grasp is like one that failed [m] (ours)
 ALIKE_TURN = 0.5  # Angle within which it is [rad] (ours)
-PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
-
-
-@dataclass(frozen=True)
-class PlanConfig(Checked):
-    """How a motion is planned. Values without a source are ours."""
-
-    num: int = 8
-    """Grasps that are asked for, in each of the batches. Each is tried as soon as it is known."""
-    top: int = 5
-    """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
-    directions: Directions = "all"
-    """Palm directions: `paper`, from above to the right side, or `all` for which the table leaves room."""
-    constraints: Constraints = field(default_factory=Constraints)
-    """What grasps have to respect, in the world's frame. The arm stays clear of obstacles too. The table is the robot's."""
-    order: Literal["score", "random"] = "score"
-    """Which reachable grasps are taken: the best by score, or any, as a control."""
-    rounds: int = 3
-    """Largest number of times that the planner is asked, each time with the next `top` grasps."""
-    rehearsals: int = 8
-    """Grasps whose lift is simulated, on the object as it is known, whenever there are new ones; 0 for none."""
-    friction: float = FRICTION
-    """Coefficient of friction between hand, object and table, for rehearsals."""
-    deviations: tuple[Deviation, ...] = DEVIATIONS
-    """How the rehearsals of one grasp deviate from what is known."""
-    sure_score: float = 0.0
-    """Log-odds of holding from which on a grasp that holds in all of its rehearsals is taken at once."""
-    trusted_share: float = 0.5
-    """Share of its rehearsals in which the best grasp of a whole batch should hold the object."""
-    trusted_score: float = 1.0
-    """Log-odds of holding that a grasp should have, where nothing is rehearsed."""
-    batches: int = 3
-    """Largest number of batches. Another is made while no grasp is trusted, or none works."""
-    candidates: int = 3
-    """Candidates for each grasp, as in `GraspRequest`."""
-    source: str | Source = AUTO
-    """What proposes grasps, as in `GraspRequest`."""
-    least_confidence: float | None = None
-    """Grasps that hold with less probability are not tried, as in `GraspRequest`."""
-    best_seconds: float = 1.0
-    """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
-    planner_seconds: float = 3.0
-    """Longest time for one path to several goals [s]."""
-    closing_seconds: float = 1.0
-    """Least time in which the hand closes [s]. Source: as in trials."""
-    grip_seconds: float = 0.5
-    """How long the hand presses before the arm lifts [s]."""
-    reach: ReachConfig = field(default_factory=ReachConfig)
-    """Approach and lift."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be done.
-
-        Raises:
-            OptionError: A number is not positive or not finite, or something is stated twice.
-        """
-        super().__post_init__()
-        if self.constraints.table is not None:
-            raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
-        if self.constraints.direction is not None and self.directions != "all":
-            raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
-        check_confidence(self.least_confidence or 0.0)
-        check_friction(self.friction)
-        for name in ("num", "top", "rounds", "batches", "planner_seconds"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
 
 
 @checked
@@ -165,111 +87,6 @@ def plan(
     raise PlanError(tries.shortage if tries.shortage and not tries.made else (
         f"{grasps_and_dropped(tries.made, tries.counts)}, and none is left for '{obj.name}'; "
         f"{task.advice(tries.counts)}"))
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """One object to lift, and to put somewhere if a place is asked for."""
-
-    cell: Workcell
-    obj: ObjectModel  # With a frame whose z axis points up
-    T: Float[np.ndarray, "4 4"]  # Where it stands in the world [m]
-    config: PlanConfig
-    constraints: Constraints  # Without obstacles, which the cell has
-    seed: int
-    start: Float[np.ndarray, " n_arm"]  # Of the arm [rad or m]
-    place: Place | None = None
-    avoid: Sequence[Float[np.ndarray, "4 4"]] = ()
-
-    @staticmethod
-    def of(
-        robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
-        config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
-        place: Place | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
-    ) -> Task:
-        """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
-        obj, T = upright(obj, T_world_object)
-        if robot.table is None:
-            robot = replace(robot, table=table_below(robot, obj, T))
-        if (scene := config.constraints.obstacles) is not None:
-            reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
-            obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
-        first = robot.home if start is None else robot.require_start(start)
-        return Task(
-            Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place,
-            avoid)
-
-    @property
-    def robot(self) -> Robot:
-        """Of the cell."""
-        return self.cell.robot
-
-    @property
-    def height(self) -> float | None:
-        """Of the table [m]."""
-        return None if self.robot.table is None else self.robot.table.height
-
-    @property
-    def distance(self) -> float:
-        """From the arm's base to the object's middle, along the ground [m]."""
-        middle = self.T[:2, :3] @ self.obj.cloud.mean(0) + self.T[:2, 3]
-        return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
-
-    def at_object(self, grasps: GraspBatch) -> GraspBatch:
-        """Grasps in the world, in the object's frame."""
-        return grasps.replace(T_object_wrist=torch.from_numpy(np.linalg.inv(self.T)).float() @ grasps.T_object_wrist)
-
-    @cached_property
-    def reach(self) -> Reachability:
-        """Inverse kinematics, with its own draws."""
-        return Reachability(self.cell, self.config.reach, self.seed, self.places)
-
-    @cached_property
-    def places(self) -> Places | None:
-        """Where the object may be put."""
-        if self.place is None:
-            return None
-        return Placing(self.cell, self.place).places()
-
-    @cached_property
-    def rehearsal(self) -> Rehearsal | None:
-        """The simulated lift, where lifts are rehearsed."""
-        wanted = self.config.rehearsals > 0 and self.config.order == "score" and self.robot.table is not None
-        return Rehearsal(self.cell, self.config.deviations, friction=self.config.friction) if wanted else None
-
-    def check_start(self) -> None:
-        """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
-        if self.config.constraints != Constraints():
-            self.config.constraints.require_fit(moved(self.obj, self.T))
-        top = float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
-        if self.height is not None and top <= self.height:
-            raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
-                            "the object in the robot's world frame (camera=..., pose=...), or correct `table` in the "
-                            "robot file")
-        if self.distance > (longest := self.robot.longest_reach):
-            raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "
-                            f"hand are long ({longest:.2f} m); give its place in the robot's world frame [m]")
-        self.cell.refuse_contacts(self.start, "at home" if np.array_equal(self.start, self.robot.home) else "at the start")
-        _ = self.places  # refused before the work
-
-    def advice(self, dropped: dict[str, int]) -> str:
-        """What to change, by the reason for which most grasps were dropped."""
-        reason = max(dropped, key=lambda r: dropped[r], default="")
-        if reason in (TURNED, SPARED, BESIDE, NARROW):
-            return (f"most grasps are {reason}; relax max_tilt, contact_region, keep_out or pregrasp_clearance, or ask for "
-                    "more grasps (num=...)")
-        return (f"the object stands {self.distance:.2f} m from the base, and most grasps are {reason}; move the object, ask "
-                "for more grasps (num=...), or for other palm directions (directions=...)")
-
-
-def table_below(robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> Table:
-    """What an object stands on where nothing else is known: a level square below it, which leaves room for the arm's base."""
-    points = obj.cloud @ T_world_object[:3, :3].T + T_world_object[:3, 3]
-    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
-    middle = (low[:2] + high[:2]) / 2
-    room = float(np.abs(middle - robot.T_world_base[:2, 3]).max()) - BASE_ROOM
-    half = max(float((high[:2] - low[:2]).max()) / 2 + SURROUNDS, min(room, ASSUMED_EXTENT / 2))
-    return Table(float(low[2]), (float(middle[0]), float(middle[1])), (2 * half, 2 * half))
 
 
 @dataclass
@@ -365,29 +182,6 @@ def candidates(
             yield grasps
             if grasps is None:
                 break
-
-
-def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator[GraspBatch]]:
-    """What makes grasps in the world's frame from a seed, as they become known."""
-    directions: Directions | Float[Tensor, "k 3"] = task.config.directions
-    if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
-        middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
-        directions = reachable_directions(task.robot, middle, task.seed)
-    clouds = [thing.cloud for thing in task.cell.obstacles]
-    wanted = replace(
-        task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
-    config, hand, obj, T = task.config, task.robot.hand, task.obj, task.T
-
-    def coming(seed: int) -> Iterator[GraspBatch]:
-        request = GraspRequest(
-            config.num, seed, config.candidates, source=config.source, least_confidence=config.least_confidence)
-        if isinstance(directions, str) and directions == "all":
-            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)))
-            yield from (in_world(grasps, T) for grasps in predictor.rounds(problem, request))
-        else:
-            yield grasps_in_world(predictor, hand, obj, T, request, wanted, directions)
-
-    return coming
 
 
 def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
@@ -550,55 +344,3 @@ def _described(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
     return notes, scene
-
-
-def paper_directions(count: int) -> Float[Tensor, "k 3"]:
-    """Unit vectors in the world, at most `count`: from above to the right side, whence the palm looks to the left.
-
-    z points up, and the robot looks along x.
-    """
-    angles = torch.linspace(0, math.pi / 2, PAPER_DIRECTIONS)
-    every = torch.stack([torch.zeros_like(angles), angles.sin(), -angles.cos()], 1)
-    return every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
-
-
-def grasps_in_world(
-    predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], request: GraspRequest,
-    wanted: Constraints, directions: Directions | Float[Tensor, "k 3"] = "all",
-) -> GraspBatch:
-    """Grasps as the predictor returns them for the same request and constraints, the best first; their frame is the world's.
-
-    The object's z axis points up, and constraints are in the world's frame. Where these want no palm direction, each of those
-    that are given, unit vectors in the world, gets a request of its own, with its share of the grasps. NoGraspError if none of
-    them finds any.
-    """
-    T = torch.from_numpy(T_world_object).float()
-    problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))
-    problems, requests = [problem], [request]
-    if not isinstance(directions, str) or directions == "paper":
-        asked = paper_directions(request.num) if isinstance(directions, str) else directions[:request.num]
-        problems = [replace(problem, constraints=replace(problem.constraints, direction=(x, y, z)))
-                    for x, y, z in (asked @ T[:3, :3]).tolist()]
-        seeds = np.random.default_rng(request.seed).integers(2**31, size=len(problems)).tolist()
-        shares = [request.num * (i + 1) // len(problems) - request.num * i // len(problems) for i in range(len(problems))]
-        requests = [replace(request, num=num, seed=seed) for num, seed in zip(shares, seeds, strict=True)]
-
-    def made(problem: GraspProblem, request: GraspRequest) -> GraspBatch | NoGraspError:
-        try:
-            return predictor.run(problem, request).grasps
-        except NoGraspError as error:  # other directions may have some
-            return error
-
-    # Alone, a request uses all threads itself.
-    parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
-    found = [part for part in parts if isinstance(part, GraspBatch)]
-    if not found:
-        raise next(part for part in parts if isinstance(part, NoGraspError))
-    return in_world(GraspBatch.concatenate(found).sorted_by_score(), T_world_object)
-
-
-def in_world(grasps: GraspBatch, T_world_object: Float[np.ndarray, "4 4"]) -> GraspBatch:
-    """Grasps of an object that stands here [m]."""
-    further = {name: column for name, column in grasps.extra.items() if name != TABLE}  # which is of the frame left behind
-    T = torch.from_numpy(T_world_object).float()
-    return grasps.replace(T_object_wrist=T @ grasps.T_object_wrist, extra=further)

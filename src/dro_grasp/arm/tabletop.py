@@ -21,11 +21,12 @@ from dro_grasp.arm.flat_plans import may_slide, plan_or_slide
 from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
 from dro_grasp.arm.physics import FRICTION, TICK, Deviation, LiftScene, check_friction
 from dro_grasp.arm.placed import draw_place, measured, place_fault
-from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.planner import plan
 from dro_grasp.arm.reachability import ReachConfig
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.table_scene import PickedObject, pick_object
 from dro_grasp.arm.table_setup import Region, other_objects, scatter
+from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import Workcell, moved
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch

@@ -108,7 +108,7 @@ class Clear:
     def _config(self) -> ClearTrialConfig:
         from dro_grasp.arm.clearing import Bin, ClearConfig
         from dro_grasp.arm.clearing_trial import ClearTrialConfig
-        from dro_grasp.arm.planner import PlanConfig
+        from dro_grasp.arm.task import PlanConfig
 
         box = Bin() if self.bin is None else Bin(self.bin[:2], self.bin[2:4], self.bin[4])
         plan = PlanConfig(self.num, rehearsals=self.rehearsals, friction=self.friction)

@@ -104,8 +104,9 @@ class Plan:
         """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
         from dro_grasp.arm.flat_plans import plan_or_slide
         from dro_grasp.arm.placing import Place
-        from dro_grasp.arm.planner import PlanConfig, plan
+        from dro_grasp.arm.planner import plan
         from dro_grasp.arm.robot import load_robot
+        from dro_grasp.arm.task import PlanConfig
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output
@@ -293,9 +294,9 @@ class Tabletop:
 
         require_extra("arm")
         from dro_grasp.arm.animation import FORMATS, draw_attempt
-        from dro_grasp.arm.planner import PlanConfig
         from dro_grasp.arm.tabletop import TabletopConfig
         from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
+        from dro_grasp.arm.task import PlanConfig
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
