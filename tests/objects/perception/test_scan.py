@@ -267,6 +267,19 @@ def test_a_plane_loses_no_points_but_strays() -> None:
     assert len(cleaned) >= 396
 
 
+def test_a_ball_keeps_its_outline_and_loses_strays() -> None:
+    """As a camera half a metre away sees it: where it turns away, its points lie as far apart as its surface is steep."""
+    radius, pixel, away = 0.03, 0.0015, 0.5
+    x, y = np.meshgrid(*[np.arange(-0.05, 0.05, pixel)] * 2)
+    inside = np.hypot(x, y) < 0.99 * radius
+    ball = np.stack([x[inside], y[inside], away - np.sqrt(radius**2 - x[inside]**2 - y[inside]**2)], 1)
+    stray = np.array([[0.0, 0.0, away - 0.06], [0.045, 0.0, away], [-0.02, -0.04, away + 0.03]])
+    assert len(without_outliers(ball)) >= 0.995 * len(ball)
+    cleaned = without_outliers(np.concatenate([ball, stray]))
+    assert len(cleaned) >= 0.995 * len(ball)
+    assert KDTree(stray).query(cleaned)[0].min() > 0, "no stray is left"
+
+
 @pytest.fixture(scope="module")
 def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What grasps a cloud in the frame of a camera file from above, without what makes good grasps."""

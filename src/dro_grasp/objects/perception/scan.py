@@ -40,6 +40,7 @@ DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of th
 LEAST_DEPTH = 0.01  # Depth of a point that a camera sees, as a share of the mean depth [1] (ours)
 FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
+APART = 4.0  # Distance to them, over the median of all points, up to which it is none [1] (ours)
 
 
 def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None) -> Float[np.ndarray, "n 3"]:
@@ -256,4 +257,5 @@ def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3
 def ordinary(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Points whose mean distance to their neighbours is not unusually large. Source: Rusu et al. 2008."""
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
-    return distance <= distance.mean() + 2.5 * distance.std()  # (ours)
+    # Where a surface turns away, at the outline, its points lie apart: they tell how it goes on, and are no outliers.
+    return np.asarray(distance <= max(distance.mean() + 2.5 * distance.std(), APART * float(np.median(distance))))  # (ours)
