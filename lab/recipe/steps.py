@@ -42,7 +42,7 @@ class Size:
     known: tuple[str, ...]  # objects that all training hands grasp
     validate: tuple[str, ...]  # objects for measuring, which enter no training bundle
     procedural: str  # objects that seeds draw
-    part: str  # of the pairs of made-up hands and objects: each hand gets others
+    part: str  # of the pairs of made-up hands and objects: a prime number, so that each hand gets other objects
     grasps: tuple[int, int, int, int]
     """Of a pair: of training hands, of those on procedural objects, of made-up hands, of held-out ones."""
     labelled: str  # by which grasps are labels that hold
@@ -61,7 +61,7 @@ FIRST_MADE = 100
 """Seed of the first made-up hand. Settings were chosen on hands of seeds below, and others are measured from 9000 on."""
 FULL = Size(
     hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
-    validate=("assets:validate",), procedural="procedural:0-399", part="1/20", grasps=(60, 8, 12, 50),
+    validate=("assets:validate",), procedural="procedural:0-399", part="1/19", grasps=(60, 8, 12, 50),
     labelled="--also robust --resettle", shipped="data/grasps", per_pair=40, pretraining="--steps 6000 --motion-steps 10000",
     training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
     "--learning-rate 7e-4",

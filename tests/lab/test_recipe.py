@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from dro_grasp.network.checkpoints import CHECKSUMS, history_of
+from dro_grasp.objects.catalogue import resolve_objects
+from dro_grasp.training.data.engine.schedule import own_pairs
 from lab.benchmarks.report import ROOT
 from lab.recipe import __main__ as recipe, pack
 from lab.recipe.__main__ import Attempt
@@ -75,6 +77,15 @@ def test_the_data_are_what_a_release_asks_for() -> None:
     first, last = map(int, FULL.procedural.removeprefix("procedural:").split("-"))
     assert last - first + 1 >= 400
     assert sum(step.share for step in STAGES["data"](FULL, "out")) == pytest.approx(1)
+
+
+def test_made_up_hands_share_all_objects_among_them() -> None:
+    objects = resolve_objects([*(name for name in FULL.known if not name.startswith("assets")), FULL.procedural])
+    for more in ([], [f"asset {k}" for k in range(48)]):  # the paper's training objects, where they are at hand
+        part, parts = map(int, FULL.part.split("/"))
+        pairs = own_pairs([str(k) for k in range(FULL.made)], [*more, *objects], (part, parts))
+        assert {hand for hand, _ in pairs} == {str(k) for k in range(FULL.made)}
+        assert {obj for _, obj in pairs} == {*more, *objects}
 
 
 def make(shared: int, given: int) -> tuple[int, str]:
