@@ -13,6 +13,8 @@ import torch
 
 from dro_grasp.files import replacing
 from dro_grasp.training.data.engine.pools import Failed, LocalPool
+from dro_grasp.training.data.engine.shards import Shard, Yield
+from dro_grasp.training.data.engine.worker import FinishedShard
 
 LIMIT = 3600.0
 """Longest time that a file may take [s]."""
@@ -28,7 +30,7 @@ def fill(make: Make, shared: Any, tasks: Iterable[Task], workers: int = 1, minut
     One that fails is told and left out; the next run tries it again.
     """
     end, missing = time.monotonic() + 60 * minutes, [task for task in tasks if not task[0].exists()]
-    pool: Any = LocalPool((make, shared), max(1, min(workers, len(missing))), LIMIT, _write)  # type: ignore[arg-type]
+    pool = LocalPool((make, shared), max(1, min(workers, len(missing))), LIMIT, _write)
     flying, waiting = 0, list(reversed(missing))
     try:
         while waiting or flying:
@@ -39,18 +41,19 @@ def fill(make: Make, shared: Any, tasks: Iterable[Task], workers: int = 1, minut
                 break
             for (path, _), told in pool.wait(60.0):
                 flying -= 1
-                print(f"{path.stem}: {told.reason if isinstance(told, Failed) else told}", flush=True)
+                print(f"{path.stem}: {told.reason if isinstance(told, Failed) else told.payload.decode()}", flush=True)
     finally:
         pool.close()
 
 
-def _write(job: tuple[Make, Any], task: Task) -> str:
+def _write(job: tuple[Make, Any], task: Task) -> FinishedShard:
+    """Make a file; what to print of it travels back where the grasps of a shard would."""
     (make, shared), (path, given) = job, task
     begin = time.monotonic()
     content, told = make(shared, given)
     with replacing(path) as temporary:
         torch.save(content, temporary)
-    return f"{told}, {time.monotonic() - begin:.0f} s"
+    return FinishedShard(Shard(path.stem, "", 0), f"{told}, {time.monotonic() - begin:.0f} s".encode(), Yield())
 
 
 def fingerprint(paths: Iterable[Path]) -> str:

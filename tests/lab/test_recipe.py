@@ -102,7 +102,9 @@ def test_parts_are_made_whole_once_and_one_that_fails_is_told(tmp_path: Path, ca
     fill(make, 10, tasks, workers=2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["0.pt", "1.pt", "3.pt"]
     assert torch.load(tmp_path / "1.pt") == 11
-    assert "2: ValueError: two is refused" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "2: ValueError: two is refused" in told
+    assert "1: made 1, 0 s" in told
 
 
 def test_weights_that_do_not_say_how_they_were_made_do_not_ship(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
