@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-full | results | results-stale | tables | lint | wheels | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | demo-arm | test | test-full | data | labels | weights | rehearse | results | results-stale | tables | release-check | lint | docs | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels docs rehearse docs-pictures data labels clean
+.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels release-check licences docs rehearse rehearse-bare docs-pictures data labels weights clean
 
 setup: $(STAMP)
 
@@ -54,11 +54,35 @@ lint: setup
 wheels: setup  # every runtime dependency has a wheel for the newer Pythons; needs the package index
 	$(BIN)/python scripts/check_wheels.py 3.12 3.13
 
+release-check: setup  # build wheel and sdist, install each extra in a fresh environment, use it far from here; downloads
+	$(BIN)/python -m lab.release $(if $(PYTHONS),--python $(BIN)/python $(PYTHONS)) $(if $(EXTRAS),--extras $(EXTRAS))
+
+licences: setup  # list the licences of all that is installed with the package, in docs/licences.md
+	$(BIN)/python -m lab.licences
+
 docs: setup  # the documents as a site in out/site; fails on unknown names and broken links
 	$(BIN)/zensical build --strict --clean
 
+# What these need: hours, and DRO_GRASP_ASSETS. Stop or kill them, and run them again: they go on. TINY=1 rehearses in minutes.
+RECIPE = $(BIN)/python -m lab.recipe
+RECIPE_OPTIONS = $(if $(TINY),--tiny --folder out/tiny) $(if $(DEVICE),--device $(DEVICE)) $(if $(WORKERS),--workers $(WORKERS))
+
+data: setup  # synthesize grasps that hold (MINUTES=600 stops then, with grasps of all pairs)
+	$(RECIPE) data $(RECIPE_OPTIONS) $(if $(MINUTES),--minutes $(MINUTES))
+
+labels: setup  # keep what of the shipped grasps passes carry and robust, and merge it with the data
+	$(RECIPE) labels $(RECIPE_OPTIONS)
+
+weights: setup  # bundle, pretrain, train, scores, completion; then the set of weights is put where it ships
+	$(RECIPE) weights $(RECIPE_OPTIONS)
+
+rehearse: setup  # data, labels and weights in small, without assets, killed once
+	rm -rf out/tiny
+	-timeout --signal KILL 60 $(RECIPE) data labels weights --tiny --folder out/tiny
+	$(RECIPE) data labels weights --tiny --folder out/tiny
+
 REHEARSAL := out/rehearsal
-rehearse: setup  # the training of a GPU machine with the slim network, in two minutes here: killed once, then finished
+rehearse-bare: setup  # the training of a GPU machine with the slim network, in two minutes here: killed once, then finished
 	rm -rf $(REHEARSAL) && mkdir -p $(REHEARSAL)/out
 	$(BIN)/dro-grasp synthesize --hand barrett gripper3 --object can torus --grasps 8 --output $(REHEARSAL)/data
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
@@ -78,24 +102,6 @@ docs-pictures: setup
 	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png
 	$(BIN)/python -m scripts.draw_studio docs/pictures/studio.png
 	$(BIN)/python -m scripts.draw_scene_page docs/pictures/scene-page.png
-
-PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
-FULLER_HANDS := assets/allegro_left assets/shadowhand
-OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right
-HELD_OUT_HANDS := assets/inspire assets/ability assets/dclaw assets/ezgripper assets/orca
-PAPER_OBJECTS := assets:train assets:validate
-
-data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
-	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
-	$(BIN)/dro-grasp synthesize --hand $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 75 --output out/other
-	$(BIN)/dro-grasp synthesize --hand $(HELD_OUT_HANDS) --object $(PAPER_OBJECTS) --grasps 50 --output out/held_out
-	$(BIN)/dro-grasp synthesize --hand $(FULLER_HANDS) --object assets:train --grasps 12 --idle 0.2 --seed 7 --output out/fuller
-	$(BIN)/dro-grasp dataset merge out/data out/fuller --output data/grasps --per-pair 190
-	$(BIN)/dro-grasp dataset merge out/other --output data/grasps --per-pair 75
-	$(BIN)/dro-grasp dataset merge out/held_out --output data/grasps --per-pair 50
-
-labels: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
-	$(BIN)/dro-grasp dataset filter data/grasps --protocol carry --also robust --resettle --again --output out/labels
 
 clean:
 	rm -rf out build dist

@@ -8,165 +8,31 @@ A table is of one state: its rows come from the same code and the same weights. 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import dataclasses
 import functools
-import hashlib
-import json
-import math
 import statistics
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.arm.motion import PLACING
-from dro_grasp.compare.metrics import success_rate
-from dro_grasp.compare.rows import ALL, Row, average
-from lab import pages
+from dro_grasp.compare.rows import average
+from lab import pages, targets
 from lab.benchmarks.report import ROOT
-from lab.measurements import FLAT_THINGS, MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART, TEST_OBJECTS
+from lab.figure import CONTROLS, FIGURE, METHODS, draw_figure, figure_data
+from lab.measurements import PAPER_HANDS, ROBOTS, SEEN_IN_PART
+from lab.reading import HEAD, MissingResult, Results, as_row, line, mixed, of, plain, select, table
+from lab.robot_tables import any_grasp, lifted, planning, robot_tasks
 from lab.runner import RESULTS
 from lab.studies import payload
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Pages that have markers."""
-FIGURE = ROOT / "docs" / "pictures" / "results.png"
-"""Success by method and protocol."""
 PAPER = {"DFC": (86.3, 76.2, 58.8), "GenDexGrasp": (67.0, 51.0, 54.2), "ManiFM-style": (None, 42.6, None),
          "D(R,O)": (87.3, 92.3, 83.0)}
 """Success on Barrett, Allegro and Shadow hand [%]. Source: paper, table of the overall comparison, in Isaac Gym."""
 STAGES = {"raw": "network alone", "refined": "refined", "settled": "refined, settled",
           "settled, ranked": "the best quarter of these by score"}
 """Stages of the network's grasps, and what they are called."""
-METHODS = {"auto": "dro-grasp", "optimiser": "optimiser alone", "mean-grasp": "mean grasp of the training set",
-           "start": "unoptimised starts"}
-"""Methods of equal time, and what they are called."""
-CONTROLS = {name: f"{text}, equal time" for name, text in METHODS.items() if name != "auto"}
-"""Those that no network takes part in."""
-TASKS = {"lifts": "lifted, held and shaken", "asked": "the same, of the one asked for among three others",
-         "placed": "placed within 2 cm and 15 degrees, of those lifted"}
-"""Measurements of attempts, and what they are called."""
-LIFTED = {*PLACING, "place", "done"}
-"""Where attempts with a place end whose object was in the air."""
-HELD_BY = "watched"
-"""What is measured of hands that may hold, in `lab.benchmarks.hold_check`."""
-Cell = dict[str, Any]
-
-
-class MissingResult(Exception):
-    """A table needs what was not measured."""
-
-
-class Results:
-    """Results of measurements, and which of them a table has looked at."""
-
-    def __init__(self, folder: Path = RESULTS) -> None:
-        self.folder, self.used = folder, {}
-
-    def cell(self, measurement: str, name: str) -> Any:
-        """What a command printed.
-
-        Raises:
-            MissingResult: It was not run as it is declared now.
-        """
-        path = self.folder / f"{measurement}.json"
-        cells = _cells(path) if path.exists() else {}
-        if cells.get(name, {}).get("command") != MEASUREMENTS[measurement].cells[name]:
-            raise MissingResult(measurement)
-        self.used[f"{measurement}: {name}"] = cells[name]
-        return cells[name]["result"]
-
-    def cells(self, measurement: str, ending: str = "") -> dict[str, Any]:
-        """What all commands of a measurement printed whose names end so."""
-        return {name: self.cell(measurement, name) for name in MEASUREMENTS[measurement].cells if name.endswith(ending)}
-
-    def some(self, measurement: str, start: str = "") -> list[Any]:
-        """What those commands printed whose names start so, of those that were run."""
-        found = list[Any]()
-        for name in MEASUREMENTS[measurement].cells:
-            if name.startswith(start):
-                with contextlib.suppress(MissingResult):
-                    found.append(self.cell(measurement, name))
-        return found
-
-    def rows(self, measurement: str, start: str = "", ending: str = "") -> list[Row]:
-        """Rows of `dro-grasp benchmark` of all commands whose names start and end so."""
-        found = [n for n in MEASUREMENTS[measurement].cells if n.startswith(start) and n.endswith(ending)]
-        return [as_row(line) for name in found for line in self.cell(measurement, name)["rows"]]
-
-
-@functools.cache
-def _cells(path: Path) -> dict[str, Cell]:
-    return json.loads(path.read_text())["cells"]
-
-
-def as_row(line: dict[str, Any]) -> Row:
-    """A row as it was before it was printed."""
-    return Row(**{field.name: _numbers(line[field.name]) for field in dataclasses.fields(Row)})
-
-
-def _numbers(value: Any) -> Any:
-    """Nothing becomes NaN again, and the label of a protocol its name."""
-    if isinstance(value, dict):
-        return {key.partition("/")[0]: _numbers(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return tuple(_numbers(v) for v in value)
-    return math.nan if value is None else value
-
-
-def mixed(used: dict[str, Cell]) -> list[str]:
-    """In what the results of one table differ that should be of one state."""
-    found = ["weights"] if len({json.dumps(cell["weights"], sort_keys=True) for cell in used.values()}) > 1 else []
-    states: dict[str, set[str]] = {}
-    for cell in used.values():
-        for name, digest in cell["code"].items():  # measurements rest on different parts
-            states.setdefault(name, set()).add(digest)
-    return found + [f"code of {name}" for name, digests in states.items() if len(digests) > 1]
-
-
-def percent(rate: Sequence[float]) -> str:
-    """Success and its interval [%]."""
-    return "-" if math.isnan(rate[0]) else f"{100 * rate[0]:.1f} [{100 * rate[1]:.0f}-{100 * rate[2]:.0f}]"
-
-
-def of(held: int, asked: int) -> str:
-    """Success of counts and its interval [%]."""
-    return percent(success_rate(held, asked))
-
-
-def table(columns: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
-    """Markdown; a column that is empty everywhere is left out."""
-    filled = [i for i, _ in enumerate(columns) if i == 0 or any(str(line[i]) for line in lines)]
-    columns, lines = [columns[i] for i in filled], [[line[i] for i in filled] for line in lines]
-    return "\n".join(f"|{'|'.join(map(str, line))}|" for line in (columns, ["---"] * len(columns), *lines))
-
-
-PROTOCOLS = ("carry", "robust", "dexgraspbench", "strict", "dro")
-"""Columns, the one that asks most of a grasp first; those that a measurement does without are left out."""
-DRAWN = ("carry", "dexgraspbench", "strict")
-"""Protocols in the figure: those of all of its methods."""
-
-
-def line(label: str, row: Row, *more: object) -> list[object]:
-    """A row's cells: asked, returned, success, fingers that touch under `strict`, and what else is given."""
-    share, everyone = row.fingers["strict"]
-    rates = [percent(row.success[p]) if p in row.success else "" for p in PROTOCOLS]
-    return [label, f"{row.asked}/{row.returned}", *rates, f"{100 * share:.0f} ({100 * everyone:.0f})", *more]
-
-
-HEAD = ["", "asked/returned", *(f"`{p}` [%]" for p in PROTOCOLS), "fingers (all) [%]"]
-
-
-def plain(hand: str) -> str:
-    """A hand's name without the folder of the assets."""
-    return hand.removeprefix("assets/")
-
-
-def select(rows: Sequence[Row], grasps: str, stage: str) -> list[Row]:
-    """Rows of single hands."""
-    return [row for row in rows if row.grasps == grasps and row.stage == stage and row.hand != ALL]
 
 
 def headline_short(results: Results) -> str:
@@ -236,69 +102,6 @@ def views(results: Results) -> str:
     """What is seen of the object, and what holds."""
     text = {"cloud": "points of the whole surface", "half": "half of the points, as in the paper", "depth": "one depth image"}
     return table(HEAD, [line(text[view], average(results.rows("views", view))) for view in text])
-
-
-def robot_tasks(results: Results) -> str:
-    """What robots do on their tables, and how often they succeed; what was not measured says so."""
-    lines = []
-    for measurement, text in TASKS.items():
-        for robot in ROBOTS:
-            tried = attempts(results, measurement, robot)
-            counted = [a for a in tried if a["stage"] in LIFTED] if measurement == "placed" else tried
-            ended = ", ".join(f"{stage} {count}" for stage, count in Counter(a["stage"] for a in tried).items())
-            good = sum(a["success"] for a in counted)
-            lines.append(counts(f"{text}, `{robot}`", measurement, len(tried), good, len(counted), ended))
-    for robot in ROBOTS:
-        done = results.some("cleared", robot)
-        removed, things, picks = (sum(cell[key] for cell in done) for key in ("removed", "things", "picks"))
-        also = f"{picks / removed:.2f} picks each, {sum(cell['tables'] for cell in done)} tables" if removed else ""
-        lines.append(counts(f"things cleared, six on a table, `{robot}`", "cleared", things, removed, things, also))
-    for robot in ROBOTS:
-        tried = [a for name in FLAT_THINGS for cell in results.some("flat_lifts", f"{robot}, {name}") for a in cell["attempts"]]
-        ended = ", ".join(f"{stage} {count}" for stage, count in Counter(a["stage"] for a in tried).items())
-        good = sum(a["success"] for a in tried)
-        lines.append(counts(f"flat and thin things lifted, held and shaken, `{robot}`", "flat_lifts", len(tried), good,
-                            len(tried), ended))
-    right, n = Counter[str](), Counter[str]()
-    for row in (row for cell in results.some("holding") for row in cell["rows"]):
-        if row["hand"] != "all" and row["measured"] == HELD_BY:
-            right[row["truth"]] += row[row["truth"]]
-            n[row["truth"]] += row["n"]
-    also = ", ".join(f"{truth} {right[truth]} of {n[truth]}" for truth in n)
-    lines.append(counts("held, empty or slipping, by the joints", "holding", n.total(), right.total(), n.total(), also))
-    return table(["", "asked", "counted", "reached [%]", "ended in"], lines)
-
-
-def attempts(results: Results, measurement: str, robot: str) -> list[dict[str, Any]]:
-    """Those of a robot, of all objects that were measured; controls are apart."""
-    return [a for object_name in TEST_OBJECTS for cell in results.some(measurement, f"{robot}, {object_name}")
-            for a in cell["attempts"]]
-
-
-def counts(text: str, measurement: str, asked: int, good: int, counted: int, also: str) -> list[object]:
-    """A line of a table of robots."""
-    if not asked:
-        return [text, "-", "-", f"not measured (`make results NAMES={measurement}`)", ""]
-    return [text, asked, counted, of(good, counted) if counted else "-", also]
-
-
-def planning(results: Results) -> str:
-    """How long robots plan, from the image of a scene."""
-    lines = []
-    for robot in ROBOTS:
-        (row,) = results.cell("planning", robot)["rows"]
-        lines.append([f"`{robot}`", row["asked"], row["planned"], row["image to plan [s], median"], row["longest"],
-                      row["median [s]"]])
-    return table(["", "scenes", "planned", "median [s]", "longest [s]", "of one core, median [s]"], lines)
-
-
-def any_grasp(results: Results) -> str:
-    """The control that takes any grasp that the arm reaches."""
-    lines = []
-    for robot in ROBOTS:
-        tried = results.cell("lifts", f"{robot}, any grasp")["attempts"]
-        lines.append([f"`{robot}`", len(tried), of(sum(a["success"] for a in tried), len(tried))])
-    return table(["", "attempts", "held [%]"], lines)
 
 
 def constraints(results: Results) -> str:
@@ -480,58 +283,6 @@ def payload_error(results: Results) -> str:
             "held no mass in trials)")
 
 
-def lifted(results: Results, robot: str) -> str:
-    """Share of attempts in which a robot held the object."""
-    if not (tried := attempts(results, "lifts", robot)):
-        raise MissingResult("lifts")
-    held = success_rate(sum(a["success"] for a in tried), len(tried))
-    return f"{100 * held[0]:.0f} % [{100 * held[1]:.0f}-{100 * held[2]:.0f}]"
-
-
-def figure_data(results: Results) -> dict[str, dict[str, Sequence[float]]]:
-    """Success and interval of each method under each protocol; nothing where it was not measured."""
-    try:
-        return _figure_data(results)
-    except MissingResult:
-        return {}
-
-
-def _figure_data(results: Results) -> dict[str, dict[str, Sequence[float]]]:
-    rows, stages = (results.rows("headline", "validate", ending) for ending in ("returned", "stages"))
-    controls = results.rows("headline", "validate", "controls")
-    found = {"network alone": average(select(stages, "network", "raw")), "returned by generate": average(rows)}
-    found |= {text: average(select(controls, name, "equal-time")) for name, text in CONTROLS.items()}
-    return {name: {p: row.success[p] for p in DRAWN} for name, row in found.items()}
-
-
-def digest(data: object) -> str:
-    """Of what a figure shows."""
-    return hashlib.sha256(json.dumps(data).encode()).hexdigest()[:16]
-
-
-def draw_figure(data: dict[str, dict[str, Sequence[float]]], path: Path) -> None:
-    """Bars with intervals; the file names the data that it was drawn from."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(8, 3.6), dpi=150)
-    width = 0.8 / max(1, len(data))
-    for i, (name, rates) in enumerate(data.items()):
-        middles = [100 * rate[0] for rate in rates.values()]
-        spread = [[100 * abs(rate[0] - rate[k]) for rate in rates.values()] for k in (1, 2)]
-        places = [j + (i - (len(data) - 1) / 2) * width for j in range(len(rates))]
-        axes.bar(places, middles, 0.92 * width, yerr=spread, capsize=2, label=name, error_kw={"linewidth": 0.8})
-    axes.set_xticks(range(len(DRAWN)), DRAWN)
-    axes.set_title("" if data else "not measured")
-    axes.set_ylabel("held [%], 95 % interval")
-    axes.set_ylim(0, 105)
-    axes.spines[["top", "right"]].set_visible(False)
-    if data:
-        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Description": digest(data)})
-    plt.close(figure)
-
-
 TABLES: dict[str, Callable[[Results], str]] = {
     "headline.short": headline_short,
     "headline.validate": functools.partial(headline_stages, where="validate"),
@@ -560,11 +311,13 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "speed.commands": commands,
     "speed.parts": parts,
     "data.again": again,
+    "targets.all": targets.all_targets,
 }
 """Tables by name."""
 VALUES: dict[str, Callable[[Results], str]] = {
     "results.machine": state,
     "gpu.told": gpu,
+    "targets.told": targets.told,
     "data.labels-told": labels_told,
     "fidelity.training": training_told,
     "payload.error": payload_error,
@@ -600,14 +353,6 @@ def outdated() -> Iterator[tuple[Path, str]]:
         text = page.read_text()
         if (wanted := pages.rendered(text, writers(TABLES), writers(VALUES))) != text:
             yield page, wanted
-
-
-def figure_is_old() -> bool:
-    """Whether the figure was drawn from other data, or is missing."""
-    from PIL import Image
-
-    with Image.open(FIGURE) as image:
-        return image.text.get("Description") != digest(figure_data(Results()))  # type: ignore[attr-defined]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

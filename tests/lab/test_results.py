@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lab import pages, runner, tables
+from lab import figure, pages, runner, tables
 from lab.measurements import MEASUREMENTS, Measurement
 
 PERCENT = re.compile(r"(?<![\w.])(?!95 %)\d+(?:\.\d+)? ?%")
@@ -22,7 +22,7 @@ def test_pages_are_what_their_data_say() -> None:
 
 
 def test_the_figure_is_of_its_data() -> None:
-    assert not tables.figure_is_old(), "run `make tables`"
+    assert not figure.figure_is_old(), "run `make tables`"
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
@@ -77,11 +77,11 @@ def test_what_was_not_measured_says_so(tmp_path: Path) -> None:
 def test_a_figure_of_what_was_not_measured_says_so(tmp_path: Path) -> None:
     from PIL import Image
 
-    nothing = tables.figure_data(tables.Results(tmp_path))
+    nothing = figure.figure_data(tables.Results(tmp_path))
     assert nothing == {}
-    tables.draw_figure(nothing, tmp_path / "figure.png")
+    figure.draw_figure(nothing, tmp_path / "figure.png")
     with Image.open(tmp_path / "figure.png") as image:
-        assert image.text["Description"] == tables.digest({})
+        assert image.text["Description"] == figure.digest({})
 
 
 def test_every_measured_rate_stands_beside_that_of_carry() -> None:

@@ -207,7 +207,8 @@ def named(text: str) -> set[str]:
     return {name for name in (*TESTED, HARD_TEST) if re.search(rf"(?<![A-Za-z]){name}(?![A-Za-z])", text)}
 
 
-RECIPES = sorted([ROOT / "Makefile", *(ROOT / "scripts").glob("train_*"), *(ROOT / "lab" / "studies").glob("*.py"),
+RECIPES = sorted([ROOT / "Makefile", *(ROOT / "scripts").glob("train_*"), *(ROOT / "lab" / "recipe").glob("*.py"),
+                  *(ROOT / "lab" / "studies").glob("*.py"),
                   *(ROOT / "src" / "dro_grasp" / "training").rglob("*.py")])
 
 
@@ -220,7 +221,7 @@ def test_a_name_in_a_recipe_would_be_seen() -> None:
     assert named("--object mug builtin:hard_test") == {HARD_TEST}
     assert named('OBJECTS = ("cube", "towel_ring")') == {"towel_ring"}
     assert not named("key, pen and book; footballer")
-    assert {"Makefile", "train_ranking.py", "train_holding_score.py"} <= {path.name for path in RECIPES}
+    assert {"Makefile", "ranking.py", "holding.py", "completion.py", "steps.py"} <= {path.name for path in RECIPES}
 
 
 def test_shipped_grasps_are_of_none_of_them() -> None:

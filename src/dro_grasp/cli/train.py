@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from dro_grasp.network.network import DistanceNetwork
     from dro_grasp.network.presets import NetworkConfig
     from dro_grasp.training.config import ScheduleConfig
+    from dro_grasp.training.data.bundle.training_file import Bundle
+    from dro_grasp.training.measures import DistanceError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +94,7 @@ class Pretrain(Stage):
 
         from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
+        from dro_grasp.provenance import made_by
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
         from dro_grasp.training.data.bundle.training_file import load_bundle
         from dro_grasp.training.measures import matching_rank
@@ -116,13 +119,15 @@ class Pretrain(Stage):
         if network.placed:
             settings["motion"] = motion
             took["seconds"] += how_long(self.run_folder / "motion")["seconds"]
-        about = took | {
-            "stage": "pretraining", "initial": self.initial, "data": bundle.summary(),
-            "settings": {name: dataclasses.asdict(part) for name, part in settings.items()},
-        }
-        save_weights(model, self.output, about, [] if self.initial is None else history_of(locate_weights(self.initial)))
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
+        about = took | {
+            "stage": "pretraining", **made_by(), "initial": self.initial,
+            "data": bundle.summary() | {"fingerprint": bundle.fingerprint},
+            "samples": took["steps"] * schedule.shards * config.hands_per_step * config.samples_per_hand,
+            "settings": {name: dataclasses.asdict(part) for name, part in settings.items()}, "metrics": {"mean_rank": ranks},
+        }
+        save_weights(model, self.output, about, [] if self.initial is None else history_of(locate_weights(self.initial)))
         report = {"output": str(self.output), "steps": about["steps"], "mean_rank": ranks, "chance": network.n_hand / 2}
         print_result(self.json, report, "mean rank of each point's counterpart", ["hand", "rank"], [*ranks.items()],
                      f"1 is perfect, {network.n_hand / 2:.0f} is chance; weights: {self.output}")
@@ -163,11 +168,11 @@ class Train(Stage):
 
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
-        from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
+        from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights
+        from dro_grasp.provenance import made_by
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
         from dro_grasp.training.data.bundle.training_file import load_bundle
         from dro_grasp.training.loop import train, train_placement
-        from dro_grasp.training.measures import distance_errors
         from dro_grasp.training.runs import is_first
 
         check_output(self.output, ".safetensors")
@@ -197,12 +202,15 @@ class Train(Stage):
             model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
         if not is_first():
             return 0
-        about = how_long(self.run_folder) | {
-            "stage": "training" if self.part == "all" else self.part, "pretrained": self.pretrained is not None,
-            "initial": self.initial, "data": bundle.summary(), "settings": dataclasses.asdict(config),
+        took = how_long(self.run_folder)
+        about = took | {
+            "stage": "training" if self.part == "all" else self.part, **made_by(), "pretrained": self.pretrained is not None,
+            "initial": self.initial, "data": bundle.summary() | {"fingerprint": bundle.fingerprint},
+            "settings": dataclasses.asdict(config),
+            "samples": took["steps"] * config.schedule.shards * config.hands_per_step * config.samples_per_hand,
         }
-        save_weights(model, self.output, about, [entry for name in given for entry in history_of(locate_weights(name))])
-        errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)
+        history = [entry for name in given for entry in history_of(locate_weights(name))]
+        errors = self._saved(model, about, history, validation)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
         values = report | {"distance_errors": [dataclasses.asdict(e) for e in errors]}
         print_result(self.json, values, "training", ["steps", "weights", "log"],
@@ -211,6 +219,23 @@ class Train(Stage):
             rows = [[e.hand, 1e3 * e.posterior, 1e3 * e.prior, e.divergence] for e in errors]
             print_table("distance error", ["hand", "posterior z [mm]", "prior z [mm]", "divergence [nat]"], rows)
         return 0
+
+    def _saved(
+        self, model: DistanceNetwork, about: dict[str, Any], history: list[dict[str, Any]], validation: Bundle | None
+    ) -> list[DistanceError]:
+        """Save the weights; with a validation bundle, measure what was saved, which states the errors then."""
+        from dataclasses import asdict
+
+        from dro_grasp.network.checkpoints import load_weights, save_weights
+        from dro_grasp.training.measures import distance_errors
+
+        save_weights(model, self.output, about, history)
+        if validation is None:
+            return []
+        errors = distance_errors(load_weights(self.output), validation, self.validation_samples)
+        metrics = {"distance_errors": [asdict(error) for error in errors], "validation": validation.fingerprint}
+        save_weights(model, self.output, about | {"metrics": metrics}, history)
+        return errors
 
 
 def how_long(run_folder: Path) -> dict[str, int]:

@@ -33,6 +33,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.stages import evaluate
+from dro_grasp.provenance import made_by
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import load_bundle, split_of
@@ -301,7 +302,8 @@ class _Onboarding:
         run = self.folder / "run" / bundle.fingerprint  # data that are made again make another run
         model = train(bundle, initial.config, config, run, name=self.folder.name, initial=initial,
                       report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))
-        about = {"stage": "fine-tuning", "initial": initial.name, "data": bundle.summary(), "minutes": self.config.minutes}
+        data = bundle.summary() | {"fingerprint": bundle.fingerprint}
+        about = {"stage": "fine-tuning", **made_by(), "initial": initial.name, "data": data, "minutes": self.config.minutes}
         save_weights(model, self.folder / WEIGHTS, about, history_of(locate_weights(self.config.weights)))
         said = f"{initial.name} fine-tuned on {bundle.n_grasps} grasps"
         return {"grasps": bundle.n_grasps, "initial": initial.name, "said": said}

@@ -151,6 +151,15 @@ def test_an_object_that_is_being_prepared_is_left_to_one_worker():
     assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "x")
 
 
+def test_a_run_that_ends_early_has_all_hands_and_all_objects():
+    states = {(hand, obj): PairState() for hand in "abc" for obj in "vwxyz"}
+    for _ in range(5):
+        states[next_pair(states, set(), 10, EngineConfig())].done = {0}
+    begun = [pair for pair, state in states.items() if state.done]
+    assert {hand for hand, _ in begun} == set("abc")
+    assert {obj for _, obj in begun} == set("vwxyz")
+
+
 def test_shards_have_seeds_of_their_own():
     shards = [Shard(h, o, r) for h in "ab" for o in "xy" for r in range(3)]
     seeds = {shard_seed(seed, shard) for seed in (0, 1) for shard in shards}

@@ -131,7 +131,7 @@ def load_holding_score(path: Path) -> HoldingScore:
     """Read a model."""
     return load_small(
         path, lambda tensors: HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"])),
-        "a score of settled grasps; train it again (scripts/train_holding_score.py)")
+        "a score of settled grasps; train it again (`python -m lab.recipe.holding`)")
 
 
 @cache

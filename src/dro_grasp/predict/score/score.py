@@ -62,10 +62,10 @@ def load_score_network(path: Path) -> ScoreNetwork:
     trained = next((entry.get(FEATURES_KEY) for entry in reversed(history_of(path))), None)
     if trained != feature_names():
         raise WeightsError(f"{path} states the features {trained}; this version computes {feature_names()}; train "
-                           "the network again (scripts/train_ranking.py)")
+                           "the network again (`python -m lab.recipe.ranking`)")
     return load_small(
         path, lambda tensors: ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"])),
-        "a ranking network; train it again (scripts/train_ranking.py)")
+        "a ranking network; train it again (`python -m lab.recipe.ranking`)")
 
 
 @cache
@@ -75,9 +75,9 @@ def shipped_score_network() -> ScoreNetwork:
 
 
 @cache
-def score_network_on(device: torch.device) -> ScoreNetwork:
-    """The same on a device."""
-    network = shipped_score_network()
+def score_network_on(device: torch.device, weights: Path | None = None) -> ScoreNetwork:
+    """The same, or one with other weights, on a device."""
+    network = shipped_score_network() if weights is None else load_score_network(weights)
     return network if device.type == "cpu" else copy.deepcopy(network).to(device)
 
 
@@ -90,6 +90,8 @@ class ScoreConfig(Checked):
     closing partly repairs."""
     batch_size: int | None = None
     """Grasps scored at once; None takes what suits the device."""
+    weights: Path | None = None
+    """Weights of the network; None takes those that ship."""
 
 
 ON_CPU = 64  # Grasps scored at once on a CPU (ours, timed)
@@ -103,10 +105,10 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
     Args:
         energy: Energy of the hand on the object, under the weights of the configuration.
         grasps: Any grasps of the two.
-        config: Batch size.
+        config: Batch size and weights.
     """
     config, device, scores = config or ScoreConfig(), energy.device, [torch.zeros(0)]
-    network, size = score_network_on(device), at_once(device, ON_CPU, EACH, config.batch_size)
+    network, size = score_network_on(device, config.weights), at_once(device, ON_CPU, EACH, config.batch_size)
     for start in range(0, len(grasps), size):
         part, own = grasps[start : start + size], energy.rows(slice(start, start + size))
         # Each finger touches with its candidate nearest to the surface.

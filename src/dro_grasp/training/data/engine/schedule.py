@@ -198,19 +198,21 @@ def _readable(
 
 
 def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
-    """The unfinished, idle pair with the fewest rounds, of hands that have had few, or None.
+    """The unfinished, idle pair with the fewest rounds, of hands and objects that have had few, or None.
 
-    Pairs on which a worker died come last. So hands take turns, and a run that ends early has grasps of all of them.
+    Pairs on which a worker died come last. So hands take turns, and objects, and a run that ends early has grasps of all of
+    them.
     """
     # New objects are spread over the workers, as preparing one can take minutes.
     open_pairs = [pair for pair, s in states.items()
                   if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)]
     prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}
-    turns = Counter(hand for hand, _ in busy)
-    for (hand, _), state in states.items():
-        turns[hand] += len(state.done)
+    turns = Counter(name for pair in busy for name in pair)
+    for pair, state in states.items():
+        for name in pair:
+            turns[name] += len(state.done)
     return min(open_pairs, default=None, key=lambda pair: (
-        states[pair].crashes, pair[1] in prepared_now, len(states[pair].done), turns[pair[0]]))
+        states[pair].crashes, pair[1] in prepared_now, len(states[pair].done), turns[pair[0]], turns[pair[1]]))
 
 
 @dataclass

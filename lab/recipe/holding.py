@@ -1,10 +1,10 @@
 """Train the score of settled grasps on outcomes of trials, and calibrate it.
 
-    python scripts/train_holding_score.py --folder FOLDER [--num N] [--rounds N] [--made N] [--minutes M] [--collect-only]
+    python -m lab.recipe.holding --folder FOLDER [--weights FILE] [--ranking FILE] [--output FILE] [--num N] [--rounds N]
 
 Candidates of the network and of the optimiser are settled as `generate` does, on training objects, on hard ones for training,
 and on stretched and heavy ones, by training hands, by the same ones smaller and larger, and by made-up hands. The folder keeps
-the grasps of each pair of hand and object, so a stopped script resumes. Needs the development assets.
+the grasps of each pair of hand and object, so a stopped script resumes. Assets are needed where hands or objects are of them.
 """
 
 from __future__ import annotations
@@ -13,33 +13,36 @@ import argparse
 import json
 import math
 import random
-import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch.nn import functional
-from train_ranking import HANDS
 
 from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
+from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.variants import vary_hand
 from dro_grasp.network.checkpoints import load_weights, save_weights
-from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import SHIPPED_HOLDING, Evidence, HoldingScore, holding_features
+from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine, scored
+from dro_grasp.provenance import made_by
 from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.made_hands.making import make_hand
+from lab.recipe.parts import fill, fingerprint
+from lab.recipe.ranking import HANDS
 
 TRIALS = ("carry", "robust")
 """Protocols whose outcome the model predicts."""
@@ -47,8 +50,10 @@ COSTLY = 0.15
 """Share of the pairs of hand and object whose grasps get the second kind of trial, too, which takes eight times as long."""
 FIRST_MADE = 20_000
 """Seed of the first made-up hand; the ranking network has seen others."""
-FACTORS = (0.5, 0.75, 1.4, 2.0)
+VARIED = {"allegro": 0.5, "barrett": 0.75, "gripper3": 1.4, "leaphand": 2.0, "shadowhand": 0.6}
 """Sizes of varied training hands."""
+GROUPS = ("assets:train", "builtin:hard_train")
+"""Groups of objects, each as often as any other."""
 STRETCH = (0.6, 1.8)
 """Bounds of the factor of an object's size, drawn for a third of the pairs."""
 HEAVY = (0.3, 8.0)
@@ -73,26 +78,29 @@ SEED = 0
 """Of fits and folds."""
 
 
-def hands(folder: Path, made: int) -> list[str]:
-    """Training hands, varied ones and made-up ones, in the order in which they are used."""
+def hands(folder: Path, trained: Sequence[str], made: int) -> list[str]:
+    """Training hands, varied ones of those that are built in, and made-up ones, in the order in which they are used."""
     folder.mkdir(parents=True, exist_ok=True)
-    found: list[str] = list(HANDS)
-    for name, factor in zip(("allegro", "barrett", "gripper3", "leaphand", "shadowhand"), (*FACTORS, 0.6), strict=True):
-        path = folder / f"{name}_{factor:g}.urdf"
+    varied = {f"{name}_{factor:g}": partial(vary_hand, name, factor=factor)
+              for name, factor in VARIED.items() if name in trained}
+    drawn = {f"hand_{seed:05d}": partial(_made, seed) for seed in range(FIRST_MADE, FIRST_MADE + made)}
+    found = list(trained)
+    for stem, make in {**varied, **drawn}.items():
+        path = folder / f"{stem}.urdf"
         if not path.exists():
-            path.write_text(vary_hand(name, factor=factor))
-        found.append(str(path))
-    for seed in range(FIRST_MADE, FIRST_MADE + made):
-        path = folder / f"hand_{seed:05d}.urdf"
-        if not path.exists():
-            path.write_text(make_hand(seed).urdf)
+            with replacing(path) as temporary:
+                temporary.write_text(make())
         found.append(str(path))
     return found
 
 
-def some_object(rng: random.Random) -> tuple[str, ObjectModel]:
-    """A training object, or a hard one for training; some are stretched, some heavy or light."""
-    label = rng.choice(resolve_objects([rng.choice(["assets:train", "builtin:hard_train"])]))
+def _made(seed: int) -> str:
+    return make_hand(seed).urdf
+
+
+def some_object(rng: random.Random, groups: Sequence[str]) -> tuple[str, ObjectModel]:
+    """A training object of these groups; some are stretched, some heavy or light."""
+    label = rng.choice(resolve_objects([rng.choice(groups)]))
     scale = rng.uniform(*STRETCH) if rng.random() < 1 / 3 else 1.0
     obj = load_object(label, scale=scale)
     low, high = HEAVY
@@ -100,9 +108,27 @@ def some_object(rng: random.Random) -> tuple[str, ObjectModel]:
     return f"{label} x{scale:.2f} m{heavier:.2f}", replace(obj, density=obj.density * heavier)
 
 
-def collect(network: DistanceNetwork, name: str, num: int, rng: random.Random) -> Iterator[dict[str, Any]]:
+@dataclass(frozen=True)
+class Plan:
+    """What is collected of each hand and turn."""
+
+    weights: str | None  # that predict the grasps
+    ranking: Path | None  # weights that rank them
+    groups: tuple[str, ...]  # of objects
+    num: int  # predicted grasps of each, and half as many of the optimiser
+
+
+def collect(plan: Plan, given: tuple[str, str]) -> tuple[list[dict[str, Any]], str]:
+    """Grasps of a hand, of this name and with this seed, on an object, and what to print of them."""
+    parts = list(tried(plan, given[0], random.Random(given[1])))
+    held = [round(share, 2) for share in torch.cat([part["outcomes"] for part in parts]).nanmean(0).tolist()]
+    return parts, f"{parts[0]['object']}, {sum(len(part['score']) for part in parts)} grasps, held {held}"
+
+
+def tried(plan: Plan, name: str, rng: random.Random) -> Iterator[dict[str, Any]]:
     """Grasps of a hand on an object: their score, what closing showed, and outcomes of trials; NaN where not tried."""
-    hand, (label, obj) = load_hand(name), some_object(rng)
+    hand, (label, obj), num, network = load_hand(name), some_object(rng, plan.groups), plan.num, load_weights(plan.weights)
+    config = ScoreConfig(weights=plan.ranking)
     problem, costly = GraspProblem(hand, obj), rng.random() < COSTLY
     generator = torch.Generator().manual_seed(rng.randrange(10**6))
     about = {"hand": hand.name, "object": label}
@@ -111,13 +137,13 @@ def collect(network: DistanceNetwork, name: str, num: int, rng: random.Random) -
     for maker, grasps in found.items():
         if not len(grasps):
             continue
-        grasps = scored(problem, refine(problem, grasps))
+        grasps = scored(problem, refine(problem, grasps), config)
         few = grasps[torch.randperm(len(grasps), generator=generator)[:UNSETTLED // len(found)]]
         yield {**about, "maker": f"{maker}, unsettled", "score": few.score,
                "outcomes": outcomes(problem, few, False), **columns(Evidence.none(len(few), obj.mass))}
         better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]
         settled = settle_grasps(problem, better)
-        yield {**about, "maker": maker, "score": scored(problem, settled.grasps).score,
+        yield {**about, "maker": maker, "score": scored(problem, settled.grasps, config).score,
                "outcomes": outcomes(problem, settled.grasps, costly), **columns(settled.known)}
 
 
@@ -133,25 +159,6 @@ def columns(known: Evidence) -> dict[str, Any]:
     """What is known of grasps, as a file keeps it."""
     own = {f.name: getattr(known, f.name) for f in fields(known) if f.name != "state"}
     return own | {"state": {f.name: getattr(known.state, f.name) for f in fields(known.state)}}
-
-
-def gather(folder: Path, made: int, rounds: int, num: int, minutes: float) -> None:
-    """Collect grasps of every hand once a round, until there are enough or the time is over."""
-    end, network = time.monotonic() + 60 * minutes, load_weights(None)
-    for turn in range(rounds):
-        for name in hands(folder / "hands", made):
-            stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
-            path = folder / f"{turn}-{stem}.pt"
-            if path.exists():
-                continue
-            if time.monotonic() > end:
-                return
-            begin = time.monotonic()
-            parts = list(collect(network, name, num, random.Random(f"{stem} {turn}")))
-            torch.save(parts, path)
-            held = torch.cat([part["outcomes"] for part in parts]).nanmean(0)
-            print(path.stem, parts[0]["object"], sum(len(p["score"]) for p in parts), [round(x, 2) for x in held.tolist()],
-                  f"{time.monotonic() - begin:.0f} s", flush=True)
 
 
 @dataclass(frozen=True)
@@ -281,25 +288,39 @@ def main() -> None:
     """Collect, fit, save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="folder for the grasps")
+    parser.add_argument("--weights", default=None, help="weights that predict the grasps; the shipped ones by default")
+    parser.add_argument("--ranking", type=Path, default=None, help="weights that rank them; the shipped ones by default")
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), help="training hands")
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), help="groups of training objects")
     parser.add_argument("--made", type=int, default=24, help="made-up hands")
     parser.add_argument("--rounds", type=int, default=8, help="objects of each hand")
     parser.add_argument("--num", type=int, default=32, help="candidates of the network for each pair, and half as many others")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="when to stop collecting")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="when to stop collecting")
+    parser.add_argument("--workers", type=int, default=1, help="processes that collect")
     parser.add_argument("--output", type=Path, default=SHIPPED_HOLDING, help="where the model is written")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    gather(options.folder, options.made, options.rounds, options.num, options.minutes)
+    plan = Plan(options.weights, options.ranking, tuple(options.groups), options.num)
+    stems = {name: Path(name).stem if Path(name).suffix else name.replace("/", "-")
+             for name in hands(options.folder / "hands", options.hands, options.made)}
+    tasks = [(options.folder / f"{turn}-{stem}.pt", (name, f"{stem} {turn}"))
+             for turn in range(options.rounds) for name, stem in stems.items()]
+    fill(collect, plan, tasks, options.workers, options.minutes)
     if options.collect_only:
         return
     rows = Rows.read(options.folder)
     found = judged(rows, SEED)
     print(json.dumps(found, indent=1))
     model = calibrated_fit(rows, set(rows.hand), SEED)
+    settings = asdict(plan) | {"ranking": str(plan.ranking or "shipped")}
     about = {
-        "stage": "ranking of settled grasps", "script": Path(__file__).name, "trials": TRIALS, "seed": SEED, **found,
-        "data": {"hands": dict(Counter(rows.hand)), "grasps": len(rows.hand), "pairs": int(rows.pair.max()) + 1},
+        "stage": "ranking of settled grasps", **made_by(), "settings": settings, "trials": TRIALS, "seed": SEED,
+        "samples": STEPS * len(rows.hand), "metrics": found,
+        "data": {"hands": dict(Counter(rows.hand)), "grasps": len(rows.hand), "pairs": int(rows.pair.max()) + 1,
+                 "fingerprint": fingerprint(sorted(options.folder.glob("*.pt")))},
     }
+    options.output.parent.mkdir(parents=True, exist_ok=True)
     save_weights(model, options.output, about)
 
 

@@ -1,11 +1,11 @@
 """Train the network that ranks grasps on the outcomes of trials of predicted grasps on training objects.
 
-    python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
+    python -m lab.recipe.ranking --folder FOLDER [--weights FILE] [--output FILE] [--num N] [--objects N] [--collect-only]
 
 Grasps are drawn at several temperatures. Most are evaluated settled, the network's and the optimiser's; some refined, raw,
 shaken, opened and moved away. Some features come from a depth image or half of a cloud. `--hands` also takes files, such as
 those of `dro-grasp hand make`. The folder keeps the trials of each hand, so a stopped script resumes. The network with the
-lowest loss on objects left out is written to the package. Needs the development assets.
+lowest loss on objects left out is written. Assets are needed where hands or objects are of them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import argparse
 import random
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 from zlib import crc32
@@ -27,26 +28,29 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights
-from dro_grasp.network.network import DistanceNetwork
+from dro_grasp.network.checkpoints import DEFAULT, load_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.features import feature_names, grasp_features
-from dro_grasp.predict.score.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
+from dro_grasp.predict.score.score import SHIPPED, ScoreConfig, ScoreNetwork, save_score_network
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
+from dro_grasp.provenance import made_by
 from dro_grasp.simulation.trial import simulate
+from lab.recipe.parts import fill, fingerprint
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
          "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
 """Training hands."""
 TRIALS = ("strict", "dexgraspbench")
-"""Protocols whose outcome the network predicts; the score is the mean of their log-odds."""
+"""Protocols whose outcome the network predicts, where no others are asked for; the score is the mean of their log-odds."""
+GROUPS = ("assets:train",)
+"""Objects, where no others are asked for."""
 FEATURES = f"{crc32(repr(feature_names()).encode()):08x}"
 """Part of the names of stored trials: trials stored with other features are not used."""
 TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
@@ -54,11 +58,9 @@ TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
 SHAKE = (0.01, 0.15, 0.2)
 """Standard deviations of a shaken grasp's shift [m], turn [rad] and joints [rad], times a number up to 2."""
 LEFT_OUT = 6
-"""Training objects left out of the fit, which select its best step."""
+"""Training objects left out of the fit, at most a third of them, which select its best step."""
 STEPS = 4000
 """Steps of the fit."""
-FURTHER_STEPS, FURTHER_RATE = 1200, 7e-4
-"""The same, and the peak learning rate, of a fit that continues from the shipped network."""
 SETTLED_WEIGHT = 3.0
 """How much more often settled grasps are drawn than others: these are what is ranked in the end."""
 BATCH = 256
@@ -94,24 +96,38 @@ def away(grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
 
 
 @torch.no_grad()
-def evaluated(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
+def evaluated(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel, trials: Sequence[str]
+) -> dict[str, Tensor]:
     """Features of grasps from the known part of the object, and outcomes of their trials on the whole object."""
     energy = GraspEnergy.of_object(hand, known, ScoreConfig().energy)
     features = grasp_features(energy, grasps, energy(grasps.T_object_wrist, grasps.joints).terms)
-    outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
+    outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in trials], 1)
     return {**features._asdict(), "outcomes": outcomes.float()}
 
 
-def collect(
-    network: DistanceNetwork, name: str, objects: int, num: int, seed: int, views: Sequence[View]
-) -> list[dict[str, Any]]:
-    """Trials of one hand on some training objects."""
-    hand, rng = load_hand(name), random.Random(f"{name} {seed}")
-    generator, parts = torch.Generator().manual_seed(seed), []
-    for label in rng.sample(resolve_objects(["assets:train"]), objects):
+@dataclass(frozen=True)
+class Plan:
+    """What is collected of each hand."""
+
+    weights: str | None  # that predict the grasps
+    groups: tuple[str, ...]  # of objects
+    objects: int  # of each hand
+    num: int  # predicted grasps of each
+    views: tuple[View, ...]
+    trials: tuple[str, ...]
+    seed: int
+
+
+def collect(plan: Plan, name: str) -> tuple[list[dict[str, Any]], str]:
+    """Trials of one hand on some training objects, and what to print of them."""
+    hand, rng, num, network = load_hand(name), random.Random(f"{name} {plan.seed}"), plan.num, load_weights(plan.weights)
+    generator, parts = torch.Generator().manual_seed(plan.seed), list[dict[str, Any]]()
+    labels = resolve_objects(list(plan.groups))
+    for label in rng.sample(labels, min(plan.objects, len(labels))):
         obj = load_object(label)
         config = ProposalConfig(temperature=rng.choice(TEMPERATURES))
-        view = rng.choice(views)
+        view = rng.choice(plan.views)
         known = partial_view(obj, view, rng.randrange(10**6))
         problem = GraspProblem(hand, known)
         # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
@@ -129,9 +145,10 @@ def collect(
             "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
             "opened": some.with_poses(some.T_object_wrist, opened), "away": away(some, generator),
         }
-        parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
+        about = {"hand": hand.name, "object": label, "view": view}
+        parts += [{**about, "kind": kind, **evaluated(hand, obj, grasps, known, plan.trials)}
                   for kind, grasps in groups.items() if len(grasps)]  # all optimised ones may have lost the object
-    return parts
+    return parts, f"{sum(len(part['whole']) for part in parts)} grasps"
 
 
 def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
@@ -153,28 +170,25 @@ def areas(network: ScoreNetwork, parts: list[dict[str, Any]]) -> list[float]:
     """Mean area under the ROC curve within groups, for each protocol."""
     with torch.no_grad():
         found = [[roc_area(network(p["links"], p["nearness"], p["whole"])[:, k], p["outcomes"][:, k] > 0.5) for p in parts]
-                 for k in range(len(TRIALS))]
+                 for k in range(parts[0]["outcomes"].shape[1] if parts else 0)]
     return [sum(x for x in a if x == x) / max(1, sum(x == x for x in a)) for a in found]
 
 
-def fit(
-    parts: list[dict[str, Any]], left_out: set[str], seed: int, further: bool
-) -> tuple[ScoreNetwork, list[float], float]:
+def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int, steps: int) -> tuple[ScoreNetwork, list[float], float]:
     """The network at its best step on objects left out, with its ROC areas and its loss there."""
     torch.manual_seed(seed)  # of the initial weights
     generator = torch.Generator().manual_seed(seed)
     train = joined([p for p in parts if p["object"] not in left_out])
     others = [p for p in parts if p["object"] in left_out]
     check = joined(others)
-    network = load_score_network(SHIPPED).requires_grad_(True) if further else ScoreNetwork(len(TRIALS))
-    steps, rate = (FURTHER_STEPS, FURTHER_RATE) if further else (STEPS, RATE)
-    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+    network = ScoreNetwork(train["outcomes"].shape[1])
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
     chance = torch.cat([torch.full((len(p["whole"]),), SETTLED_WEIGHT if "settled" in p["kind"] else 1.0)
                         for p in parts if p["object"] not in left_out])
     best, best_state = float("inf"), network.state_dict()
     for step in range(1, steps + 1):
-        rows = torch.multinomial(chance, BATCH, generator=generator)
+        rows = torch.multinomial(chance, min(BATCH, len(chance)), generator=generator)
         links, nearness, whole, outcomes = (train[k][rows] for k in ("links", "nearness", "whole", "outcomes"))
         links = links + NOISE * torch.randn(links.shape, generator=generator)
         loss = functional.binary_cross_entropy_with_logits(network(links, nearness, whole), outcomes)
@@ -182,7 +196,7 @@ def fit(
         loss.backward()
         optimiser.step()
         schedule.step()
-        if step % 100 == 0:
+        if step % 100 == 0 or step == steps:
             with torch.no_grad():
                 now = float(functional.binary_cross_entropy_with_logits(
                     network(check["links"], check["nearness"], check["whole"]), check["outcomes"]))
@@ -197,43 +211,44 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="folder for the trials")
     parser.add_argument("--weights", default=None, help="weights that predict the grasps; the shipped ones by default")
+    parser.add_argument("--output", type=Path, default=SHIPPED, help="where the network is written")
     parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect trials of")
-    parser.add_argument("--objects", type=int, default=16, help="training objects of each hand")
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), help="training objects")
+    parser.add_argument("--objects", type=int, default=16, help="of these for each hand")
     parser.add_argument("--num", type=int, default=16, help="predicted grasps of each")
+    parser.add_argument("--trials", nargs="+", default=list(TRIALS), help="protocols whose outcome is predicted")
     parser.add_argument("--views", nargs="+", choices=get_args(View), default=["whole", "whole", "half", "depth"],
                         help="views of the objects; naming one twice doubles its share")
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of the fit")
+    parser.add_argument("--workers", type=int, default=1, help="processes that collect")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything")
-    parser.add_argument("--further", action="store_true", help="continue from the shipped network instead of random weights")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.folder.mkdir(parents=True, exist_ok=True)
-    for name in options.hands:
-        stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
-        path = options.folder / f"{stem}-{options.seed}-{FEATURES}.pt"
-        if not path.exists():
-            found = collect(
-                load_weights(options.weights), name, options.objects, options.num, options.seed, options.views)
-            torch.save(found, path)
-            print(name, flush=True)
+    plan = Plan(options.weights, tuple(options.groups), options.objects, options.num, tuple(options.views),
+                tuple(options.trials), options.seed)
+    stems = {name: Path(name).stem if Path(name).suffix else name.replace("/", "-") for name in options.hands}
+    fill(collect, plan, [(options.folder / f"{stem}-{plan.seed}-{FEATURES}.pt", name) for name, stem in stems.items()],
+         options.workers)
     if options.collect_only:
         return
-    parts = [part for path in sorted(options.folder.glob(f"*-{FEATURES}.pt")) for part in torch.load(path, weights_only=True)]
+    files = sorted(options.folder.glob(f"*-{FEATURES}.pt"))
+    parts = [part for path in files for part in torch.load(path, weights_only=True)]
     names = sorted({part["object"] for part in parts})
-    left_out = set(random.Random(0).sample(names, LEFT_OUT))
-    network, found, loss = fit(parts, left_out, options.seed, options.further)
+    left_out = set(random.Random(0).sample(names, min(LEFT_OUT, max(1, len(names) // 3))))
+    network, found, loss = fit(parts, left_out, plan.seed, options.steps)
     print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
-          + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(TRIALS, found, strict=True)))
+          + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(plan.trials, found, strict=True)))
     about = {
-        "stage": "ranking", "script": Path(__file__).name, "weights": options.weights or DEFAULT,
-        "steps": FURTHER_STEPS if options.further else STEPS, "further": options.further,
-        "trials": TRIALS, "seed": options.seed, "left_out": sorted(left_out), "loss": loss, "areas": found,
+        "stage": "ranking", **made_by(), "weights": options.weights or DEFAULT, "settings": asdict(plan),
+        "steps": options.steps, "trials": plan.trials, "seed": plan.seed, "left_out": sorted(left_out),
+        "samples": BATCH * options.steps, "metrics": {"loss": loss, "areas": dict(zip(plan.trials, found, strict=True))},
         "data": {"hands": dict(Counter(p["hand"] for p in parts for _ in p["whole"])), "objects": len(names),
-                 "grasps": sum(len(p["whole"]) for p in parts)},
+                 "grasps": sum(len(p["whole"]) for p in parts), "fingerprint": fingerprint(files)},
     }
-    SHIPPED.parent.mkdir(exist_ok=True)
-    before = history_of(SHIPPED) if options.further else []
-    save_score_network(network, SHIPPED, about, before)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    save_score_network(network, options.output, about)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """Train the network that completes objects seen in part, on views of training objects with known surfaces.
 
-    python -m lab.studies.train_completion --folder FOLDER [--part K N] [--steps N] [--collect-only]
+    python -m lab.recipe.completion --folder FOLDER [--output FILE] [--objects GROUP ...] [--steps N] [--workers N]
 
 Each object is viewed in its own and in stretched shapes, as half of a cloud and by a depth camera, from many sides. The
 network learns its true signed distance near its surface, near the surfaces that symmetries guess, and around both. The
-folder keeps the views of each object, so a stopped script resumes, and other processes can take other objects. The script
-reports errors on objects left out of a first fit; the network written to the package is fitted to all. Needs the
-development assets.
+folder keeps the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the
+network that is written is fitted to all. Assets are needed where objects are of them.
 """
 
 from __future__ import annotations
@@ -31,6 +30,8 @@ from dro_grasp.objects.perception.completion import GUESSES, THINNEST, surface_f
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
+from dro_grasp.provenance import made_by
+from lab.recipe.parts import fill, fingerprint
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")
@@ -122,10 +123,11 @@ def view_of(
     return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
 
 
-def collect(label: str, seed: int) -> Views:
-    """Views of one object and its stretched shapes."""
+def collect(shapes: int, given: tuple[str, int]) -> tuple[tuple[Tensor, ...], str]:
+    """Views of the object of this name, seen with this seed, and of its stretched shapes, and what to print of them."""
+    label, seed = given
     rng, own, found, kinds = np.random.default_rng(seed), load_object(label), [], []
-    for shape in range(SHAPES):
+    for shape in range(shapes):
         try:
             obj = own if shape == 0 else stretched(own, rng)
         except ObjectError as error:
@@ -136,7 +138,7 @@ def collect(label: str, seed: int) -> Views:
             found += views
             kinds += [k] * len(views)
     guessed, features, truth, unseen = (torch.stack(column) for column in zip(*found, strict=True))
-    return Views(guessed, features, truth, torch.tensor(kinds), unseen)
+    return tuple(Views(guessed, features, truth, torch.tensor(kinds), unseen)), f"{len(kinds)} views"
 
 
 def joined(parts: list[Views]) -> Views:
@@ -172,44 +174,56 @@ def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
 
 
 @torch.no_grad()
-def report(network: SurfaceNetwork, views: Views) -> None:
-    """Errors at unseen points, beside those of the best symmetry."""
+def errors(network: SurfaceNetwork, views: Views) -> dict[str, dict[str, float]]:
+    """Errors at unseen points near the surface [m], and the share on the right side of it, also of the best symmetry."""
+    found = {}
     for k, kind in enumerate(KINDS):
         some = Views(*(column[views.kind == k] for column in views))
+        if not len(some.kind):
+            continue
         predicted = torch.cat([network(g, f) for g, f in zip(some.guessed.split(16), some.features.split(16), strict=True)])
         for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):
             near = some.unseen & (some.truth.abs() < 0.01)
-            inside = ((values < 0) == (some.truth < 0))[some.unseen].float().mean()
-            print(f"{kind}, unseen, {name}: error {1e3 * error(values, some.truth)[near].mean():.2f} mm near the "
-                  f"surface, {100 * inside:.1f} % on the right side of it")
+            found[f"{kind}, {name}"] = {
+                "error": float(error(values, some.truth)[near].mean()),
+                "right side": float(((values < 0) == (some.truth < 0))[some.unseen].float().mean())}
+    return found
 
 
 def main() -> None:
-    """Collect, fit without some objects and report, fit with all and save."""
+    """Collect, fit without some objects and measure, fit with all and save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="folder for the views")
-    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="collect the k-th of n parts")
+    parser.add_argument("--output", type=Path, default=SHIPPED, help="where the network is written")
+    parser.add_argument("--objects", nargs="+", default=["assets:train", "builtin:train"], help="training objects")
+    parser.add_argument("--shapes", type=int, default=SHAPES, help="shapes of each object; all but one are stretched")
     parser.add_argument("--steps", type=int, default=2500, help="steps of each of the two fits")
+    parser.add_argument("--workers", type=int, default=1, help="processes that collect")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.folder.mkdir(parents=True, exist_ok=True)
-    labels = resolve_objects(["assets:train", "builtin:train"])
-    for k, label in list(enumerate(labels))[options.part[0]::options.part[1]]:
-        path = options.folder / f"{label.replace('/', '-')}-{options.seed}.pt"
-        if not path.exists():
-            torch.save(tuple(collect(label, options.seed * len(labels) + k)), path)
-            print(label, flush=True)
+    labels = resolve_objects(options.objects)
+    tasks = [(options.folder / f"{label.replace('/', '-')}-{options.seed}.pt", (label, options.seed * len(labels) + k))
+             for k, label in enumerate(labels)]
+    fill(collect, options.shapes, tasks, options.workers)
     if options.collect_only:
         return
-    parts = [Views(*torch.load(path, weights_only=True)) for path in sorted(options.folder.glob("*.pt"))]
+    files = sorted(options.folder.glob("*.pt"))
+    parts = [Views(*torch.load(path, weights_only=True)) for path in files]
     left_out = [part for k, part in enumerate(parts) if k % EVERY == 0]
-    report(fit(joined([p for k, p in enumerate(parts) if k % EVERY]), options.steps, options.seed), joined(left_out))
-    SHIPPED.parent.mkdir(exist_ok=True)
-    about = {"stage": "completion", "script": Path(__file__).name, "steps": options.steps, "seed": options.seed,
-             "data": {"objects": len(parts), "views": sum(len(part.kind) for part in parts)}}
-    save_weights(fit(joined(parts), options.steps, options.seed), SHIPPED, about)
+    apart = fit(joined([p for k, p in enumerate(parts) if k % EVERY]), options.steps, options.seed)
+    found = errors(apart, joined(left_out))
+    for name, measured in found.items():
+        print(f"{name}: error {1e3 * measured['error']:.2f} mm near the surface, {100 * measured['right side']:.1f} % on the "
+              "right side of it")
+    about = {
+        "stage": "completion", **made_by(), "steps": options.steps, "seed": options.seed, "metrics": found,
+        "samples": options.steps * VIEWS * SOME,
+        "data": {"objects": len(parts), "views": sum(len(part.kind) for part in parts), "fingerprint": fingerprint(files)}}
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    save_weights(fit(joined(parts), options.steps, options.seed), options.output, about)
 
 
 if __name__ == "__main__":

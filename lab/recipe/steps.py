@@ -1,0 +1,165 @@
+"""The steps from nothing to data, labels and weights, in two sizes: as it is meant, and a rehearsal of minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dro_grasp.network.checkpoints import DEFAULT, SMALL
+from lab.measurements import UNSEEN_HANDS
+from lab.recipe.ranking import HANDS
+
+PACKAGED = "src/dro_grasp/network/weights"
+"""Where weights ship."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command; a rerun of a killed one goes on."""
+
+    name: str
+    command: str
+    """`{run}` stands for a folder that belongs to this command and the content that it reads."""
+    makes: str = ""
+    """Its file, by which it is known to be done; a step without one is run each time, and finds what is missing itself."""
+    reads: tuple[str, ...] = ()
+    """Files and folders: with other content in them, it is run anew."""
+    free: str = ""
+    """Options that decide how fast it goes and not what comes out, with {workers}, {device} and {minutes}."""
+    share: float = 0.0
+    """Share of the time limit."""
+    processes: bool = False
+    """Whether torchrun divides it among processes, on a processor."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much of everything."""
+
+    hands: tuple[str, ...]  # for training
+    held_out: tuple[str, ...]  # for few-shot data alone
+    made: int  # made-up hands, from seed FIRST_MADE on
+    known: tuple[str, ...]  # objects that all training hands grasp
+    validate: tuple[str, ...]  # objects for measuring, which enter no training bundle
+    procedural: str  # objects that seeds draw
+    part: str  # of the pairs of made-up hands and objects: a prime number, so that each hand gets other objects
+    grasps: tuple[int, int, int, int]
+    """Of a pair: of training hands, of those on procedural objects, of made-up hands, of held-out ones."""
+    labelled: str  # by which grasps are labels that hold
+    shipped: str  # older grasps, which become labels by the filter
+    per_pair: int  # grasps in the training bundle
+    pretraining: str
+    training: str
+    placement: str
+    ranking: str
+    holding: str
+    completion: str
+    into: str  # folder of the finished weights
+
+
+FIRST_MADE = 100
+"""Seed of the first made-up hand. Settings were chosen on hands of seeds below, and others are measured from 9000 on."""
+FULL = Size(
+    hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
+    validate=("assets:validate",), procedural="procedural:0-399", part="1/19", grasps=(60, 8, 12, 50),
+    labelled="--also robust --resettle", shipped="data/grasps", per_pair=40, pretraining="--steps 6000 --motion-steps 10000",
+    training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
+    "--learning-rate 7e-4",
+    placement="--steps 2600 --partial 0.25",
+    ranking="--groups assets:train builtin:train builtin:hard_train procedural:0-199 --objects 16 --num 16 "
+    "--trials carry robust",
+    holding="--groups assets:train builtin:hard_train procedural:200-399 --made 64 --rounds 8 --num 32",
+    completion="--objects assets:train builtin:train", into=PACKAGED)
+TINY = Size(
+    hands=("gripper3",), held_out=(), made=2, known=("can", "torus"), validate=(), procedural="procedural:0-0",
+    part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", per_pair=6,
+    pretraining="--preset slim --steps 4 --motion-steps 4",
+    training="--preset slim --steps 8 --shards 2 --samples-per-hand 2 --validation-samples 10", placement="--steps 4",
+    ranking="--groups can torus sphere --objects 2 --num 8 --trials carry --views whole --steps 100",
+    holding="--groups can torus --made 1 --rounds 1 --num 8", completion="--objects can torus sphere --shapes 1 --steps 60",
+    into="{folder}/weights/shipped")
+RANKED = 40
+"""Made-up hands of which the ranking network learns."""
+AT_ONCE = "--workers {workers} --device {device} --minutes {minutes}"
+
+
+def made_hands(size: Size, folder: str) -> list[str]:
+    """Files of the made-up hands."""
+    return [f"{folder}/made_hands/hand_{seed:05d}.urdf" for seed in range(FIRST_MADE, FIRST_MADE + size.made)]
+
+
+def data(size: Size, folder: str) -> list[Step]:
+    """Grasps that hold, in `FOLDER/data`."""
+    hands, made = " ".join(size.hands), f"{folder}/made_hands"
+    known, validate = " ".join(size.known), " ".join(size.validate)
+    usual, drawn, by_made, few = size.grasps
+
+    def grasps(name: str, of: str, on: str, each: int, share: float, more: str = "--seed 0") -> Step:
+        return Step(name, f"dro-grasp synthesize --hand {of} --object {on} --grasps {each} --output {folder}/data/{name} "
+                    f"{size.labelled} {more}", free=AT_ONCE, share=share)
+
+    steps = [
+        Step("made hands", f"dro-grasp hand make --seed {FIRST_MADE} --num {size.made} --output {made} --overwrite",
+             f"{made}/hands.csv"),
+        grasps("known", hands, f"{known} {validate}".strip(), usual, 0.35),
+        grasps("fuller", hands, known, max(1, usual // 3), 0.1, "--idle 0.2 --seed 7"),
+        grasps("procedural", hands, size.procedural, drawn, 0.2),
+        grasps("made", " ".join(made_hands(size, folder)), f"{known} {size.procedural}", by_made, 0.25,
+               f"--seed 0 --shard {size.part}"),
+    ]
+    if size.held_out:
+        steps.append(grasps("held_out", " ".join(size.held_out), f"assets:train {validate}", few, 0.1))
+    return steps
+
+
+def labels(size: Size, folder: str) -> list[Step]:
+    """Older grasps by the same measure, in `FOLDER/labels`, and all of them in one file a hand, in `FOLDER/grasps`."""
+    made = " ".join(f"{folder}/data/{step.name}" for step in data(size, folder) if step.share)
+    return [
+        Step("labels", f"dro-grasp dataset filter {size.shipped} --protocol carry --also robust --resettle --again "
+             f"--output {folder}/labels", free="--workers {workers}"),
+        Step("grasps", f"dro-grasp dataset merge {made} {folder}/labels --output {folder}/grasps --per-pair 150"),
+        Step("card", f"python -m lab.benchmarks.data_card {folder}/grasps"),
+    ]
+
+
+def weights(size: Size, folder: str) -> list[Step]:
+    """The set of four weights, in `FOLDER/weights`, and where they ship."""
+    grasps, own = f"{folder}/grasps", f"{folder}/weights"
+    bundle, validation, pretrained, trained, network, surface, quality, holding = (
+        f"{own}/{name}.safetensors" for name in (
+            "bundle", "validation", "pretrained", "trained", DEFAULT, *SMALL))
+    made = " ".join(made_hands(size, folder)[:RANKED])
+    checked = validation if size.validate else bundle
+    run, seed = "--run-folder {run}", "--seed 0"
+
+    def trains(name: str, command: str, output: str, *reads: str, processes: bool = True) -> Step:
+        return Step(name, f"dro-grasp {command} --bundle {bundle} {run} --output {output} {seed}", output, (bundle, *reads),
+                    "--device {device}", processes=processes)
+
+    def packs(name: str, output: str, options: str) -> Step:
+        return Step(name, f"dro-grasp dataset bundle {grasps} --output {output} {options}", output, (grasps,))
+
+    steps = [packs("bundle", bundle, f"--per-pair {size.per_pair}")]
+    if size.validate:
+        steps.append(packs("validation", validation, "--split validate --per-pair 20"))
+    return [
+        *steps,
+        trains("pretraining", f"pretrain {size.pretraining}", pretrained, processes=False),
+        trains("training", f"train {size.training} --pretrained {pretrained} --validation {checked}", trained, pretrained,
+               checked),
+        trains("placement", f"train --part placement {size.placement} --initial {trained} --validation {checked}"
+               f"{' --validation-samples 10' if size is TINY else ''}", network, trained, checked, processes=False),
+        Step("ranking", f"python -m lab.recipe.ranking --folder {{run}} --weights {network} --output {quality} "
+             f"--hands {' '.join(size.hands)} {made} {size.ranking} {seed}", quality, (network,), "--workers {workers}"),
+        Step("holding", f"python -m lab.recipe.holding --folder {{run}} --weights {network} --ranking {quality} "
+             f"--output {holding} --hands {' '.join(size.hands)} {size.holding}", holding, (network, quality),
+             "--workers {workers}"),
+        Step("completion", f"python -m lab.recipe.completion --folder {{run}} --output {surface} {size.completion} {seed}",
+             surface, free="--workers {workers}"),
+        Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{' --changed' if size is TINY else ''}"),
+    ]
+
+
+STAGES: dict[str, Callable[[Size, str], list[Step]]] = {"data": data, "labels": labels, "weights": weights}
+"""What can be made, in this order."""

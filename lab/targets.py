@@ -1,0 +1,252 @@
+"""The targets of 1.0, each beside what was measured of it: reached, not reached, or not measured.
+
+    python -m lab.targets
+
+docs/results.md has the same table. Rows are of the state that each names, which may differ; those of one row do not.
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from dro_grasp.compare.metrics import success_rate
+from dro_grasp.compare.rows import Row, average
+from lab.benchmarks import gpu_table
+from lab.benchmarks.report import ROOT
+from lab.measurements import FLAT_THINGS, PAPER_HANDS, ROBOTS
+from lab.reading import MissingResult, Results, as_row, mixed, percent, plain, select, table
+from lab.robot_tables import HELD_BY, LIFTED, attempts
+
+PUBLISHED = ROOT / "lab" / "notebook" / "2026-11-published-hands.csv"
+"""Twenty-four published hands, judged from pictures one by one."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was measured."""
+
+    value: float
+    told: str  # with its unit, and interval and number where it is a rate
+
+
+Measure = Callable[[Results], Found]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One thing to reach."""
+
+    subject: str
+    what: str
+    goal: float
+    measure: Measure | None  # None: no command of the repository measures it
+    least: bool = True  # whether more is better
+    unit: str = "%"
+
+    def line(self, results: Results) -> list[object]:
+        """What, the goal, what was measured of which commit, and whether it is reached."""
+        sign = "at least" if self.least else "at most"
+        start = [self.subject, self.what, f"{sign} {self.goal:g} {self.unit}".strip()]
+        own = Results(results.folder)
+        try:
+            if self.measure is None:
+                raise MissingResult("")
+            found = self.measure(own)
+        except MissingResult:
+            return [*start, "", "", "not measured"]
+        if states := mixed(own.used):
+            raise ValueError(f"'{self.what}' would mix states: {', '.join(states)}; run `make results` for what is stale")
+        commits = sorted({cell["commit"] for cell in own.used.values()})
+        reached = found.value >= self.goal if self.least else found.value <= self.goal
+        return [*start, found.told, ", ".join(commits), "reached" if reached else "**not reached**"]
+
+
+def rate(row: Row, protocol: str) -> Found:
+    """Success of grasps that were asked for."""
+    if protocol not in row.success:
+        raise MissingResult(protocol)
+    return Found(100 * row.success[protocol][0], f"{percent(row.success[protocol])} of {row.asked}")
+
+
+def counted(good: int, n: int) -> Found:
+    """Success of counts."""
+    if not n:
+        raise MissingResult("")
+    return Found(100 * good / n, f"{percent(success_rate(good, n))} of {n}")
+
+
+def alone(results: Results, where: str, protocol: str) -> Found:
+    """The network's grasps as it makes them, of the paper's hands."""
+    return rate(average(select(results.rows("headline", where, "stages"), "network", "raw")), protocol)
+
+
+def _unseen(results: Results) -> list[Row]:
+    return select(results.rows("unseen", ending="network alone"), "network", "raw")
+
+
+def unseen(results: Results, protocol: str) -> Found:
+    """The same of hands that no weights were trained on."""
+    return rate(average(_unseen(results)), protocol)
+
+
+def worst_unseen(results: Results, protocol: str) -> Found:
+    """The worst of these hands."""
+    rows = _unseen(results)
+    if any(protocol not in row.success for row in rows):
+        raise MissingResult(protocol)
+    worst = min(rows, key=lambda row: row.success[protocol][0])
+    found = rate(worst, protocol)
+    return Found(found.value, f"{found.told}, {plain(worst.hand)}")
+
+
+def optimisers_share(results: Results) -> Found:
+    """How much of what is returned for unseen hands the optimiser made."""
+    rows = select(results.rows("unseen", ending="returned"), "auto", "returned")
+    shares = [100 * row.optimised for row in rows]
+    every = 100 * average(rows).optimised
+    return Found(every, f"{every:.0f}, by hand {min(shares):.0f} to {max(shares):.0f}")
+
+
+def diversity(results: Results, hand: str) -> Found:
+    """The paper's measure, over what is returned on the paper's objects."""
+    (row,) = (row for row in results.rows("headline", "validate", "returned") if row.hand == hand)
+    return Found(round(row.diversity, 3), f"{row.diversity:.3f} of {row.returned}")
+
+
+def paper_form(results: Results) -> Found:
+    """The paper's own form, slim, under its own protocol."""
+    (found,) = results.cell("fidelity", "trained")["pretrained"]
+    return rate(average(select(list(map(as_row, found["rows"])), "network", "raw")), "dro")
+
+
+def seconds(results: Results, name: str) -> Found:
+    """A whole command."""
+    value = results.cell("speed", "commands")[name]
+    return Found(value, f"{value:.2g}")
+
+
+def latency(results: Results, name: str) -> Found:
+    """One grasp, on two cores [ms]."""
+    value = 1e3 * results.cell("speed", "inference")[name]
+    return Found(value, f"{value:.0f}")
+
+
+def tried(results: Results, robot: str, measurement: str) -> Found:
+    """Attempts of a robot that succeed; of those with a place, of what was lifted."""
+    own = attempts(results, measurement, robot)
+    counts = [a for a in own if a["stage"] in LIFTED] if measurement == "placed" else own
+    return counted(sum(a["success"] for a in counts), len(counts))
+
+
+def cleared(results: Results) -> Found:
+    """Things that both robots take from their tables."""
+    done = [cell for robot in ROBOTS for cell in results.some("cleared", robot)]
+    return counted(sum(cell["removed"] for cell in done), sum(cell["things"] for cell in done))
+
+
+def picks(results: Results) -> Found:
+    """Picks for each of these."""
+    done = [cell for robot in ROBOTS for cell in results.some("cleared", robot)]
+    if not (removed := sum(cell["removed"] for cell in done)):
+        raise MissingResult("cleared")
+    value = sum(cell["picks"] for cell in done) / removed
+    return Found(value, f"{value:.2f} for {removed} things")
+
+
+def holding(results: Results) -> Found:
+    """Judgements by the joints that are right."""
+    rows = [row for cell in results.some("holding") for row in cell["rows"]
+            if row["hand"] != "all" and row["measured"] == HELD_BY]
+    return counted(sum(row[row["truth"]] for row in rows), sum(row["n"] for row in rows))
+
+
+def planning(results: Results, column: str, choose: Callable[[list[float]], float]) -> Found:
+    """Time from the image of a scene to a plan, of both robots [s]."""
+    rows = [results.cell("planning", robot)["rows"][0] for robot in ROBOTS]
+    value = choose([row[column] for row in rows])
+    return Found(value, f"{value:.1f} of {sum(row['asked'] for row in rows)} scenes")
+
+
+def flat(results: Results) -> Found:
+    """Flat and thin things that both robots lift."""
+    own = [a for robot in ROBOTS for name in FLAT_THINGS for cell in results.some("flat_lifts", f"{robot}, {name}")
+           for a in cell["attempts"]]
+    return counted(sum(a["success"] for a in own), len(own))
+
+
+def published(_: Results, columns: tuple[str, ...]) -> Found:
+    """Published hands that are right in all these columns of the notebook, in their last state."""
+    with PUBLISHED.open() as file:
+        last = {line["hand"]: line for line in csv.DictReader(file)}
+    good = sum(all(line[column] == "yes" for column in columns) for line in last.values())
+    return Found(good, f"{good} of {len(last)}")
+
+
+def on_gpu(results: Results, row: gpu_table.Row) -> Found:
+    """A row of the table of GPUs."""
+    cell = results.cell("gpu", "table")
+    if row.name not in cell["rows"]:
+        raise MissingResult("gpu")
+    value = row.value(cell["rows"][row.name])
+    return Found(value, f"{value:,.4g}")
+
+
+RIGHT = ("accepted", "fingers", "thumb", "side", "palm", "open")
+"""What of a published hand is judged from pictures."""
+
+
+def targets() -> Iterator[Target]:
+    """All of them, by subject."""
+    yield Target("hands", "published hands accepted as they are, of 24", 23, partial(published, columns=("accepted",)), unit="")
+    yield Target("hands", "right by pictures, of these", 22, partial(published, columns=RIGHT), unit="")
+    for row in gpu_table.ROWS:
+        yield Target("GPU", row.what, row.goal, partial(on_gpu, row=row), not row.fewer, row.unit)
+    yield Target("two cores", "one of sixteen grasps with its candidates", 80,
+                 partial(latency, name="batch16_per_grasp_default"), False, "ms")
+    yield Target("two cores", "one grasp alone", 250, partial(latency, name="latency_default"), False, "ms")
+    yield Target("two cores", "`generate --num 1`", 3.5, partial(seconds, name="1 grasp"), False, "s")
+    yield Target("two cores", "`generate --num 16`", 4, partial(seconds, name="16 grasps"), False, "s")
+    for measurement, what, goal in (("lifts", "lifted, held and shaken", 95), ("asked", "the same, asked for among others", 95),
+                                    ("placed", "placed, of those lifted", 90)):
+        for robot in ROBOTS:
+            yield Target("robots", f"{what}, `{robot}`", goal, partial(tried, robot=robot, measurement=measurement))
+    yield Target("robots", "things cleared, six on a table", 95, cleared)
+    yield Target("robots", "picks for each", 1.3, picks, False, "")
+    yield Target("robots", "holding, empty or slipping told", 98, holding)
+    median = partial(planning, column="image to plan [s], median", choose=statistics.fmean)
+    yield Target("robots", "scene image to plan, median", 5, median, False, "s")
+    yield Target("robots", "the same, longest", 12, partial(planning, column="longest", choose=max), False, "s")
+    yield Target("robots", "flat and thin things lifted", 60, flat)
+    for where, goals in (("validate", (97, 88, 75)), ("test", (92, 75, 60))):
+        for protocol, goal in zip(("dro", "strict", "dexgraspbench"), goals, strict=True):
+            yield Target("network alone", f"paper's hands, {'paper' if where == 'validate' else 'built-in test'} objects, "
+                         f"`{protocol}`", goal, partial(alone, where=where, protocol=protocol))
+    for protocol, every, each in (("dro", 88, 75), ("strict", 72, 45)):
+        yield Target("network alone", f"unseen hands, `{protocol}`", every, partial(unseen, protocol=protocol))
+        yield Target("network alone", f"the worst of them, `{protocol}`", each, partial(worst_unseen, protocol=protocol))
+    yield Target("network alone", "paper's form, `dro`", 90, paper_form)
+    yield Target("returned", "made by the optimiser, unseen hands", 20, optimisers_share, False)
+    for hand, goal in zip(PAPER_HANDS, (0.53, 0.40, 0.40), strict=True):
+        yield Target("returned", f"diversity, {plain(hand)}", goal, partial(diversity, hand=hand), unit="")
+    yield Target("returned", "share of the candidates at equal success", 50, None, False)
+
+
+def all_targets(results: Results) -> str:
+    """The table."""
+    lines = [target.line(results) for target in targets()]
+    return table(["", "target", "to reach", "measured", "commit", ""], lines)
+
+
+def told(results: Results) -> str:
+    """How many are reached, are not, and are not measured."""
+    ends = [str(target.line(results)[-1]).strip("*") for target in targets()]
+    return ", ".join(f"{ends.count(end)} {end}" for end in ("reached", "not reached", "not measured")) + f", of {len(ends)}"
+
+
+if __name__ == "__main__":
+    print(all_targets(Results()))
+    print(told(Results()))

@@ -1,0 +1,148 @@
+"""The recipe: every step is resumed after a kill, stale steps run anew, and what ships says how it was made."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dro_grasp.network.checkpoints import CHECKSUMS, history_of
+from dro_grasp.objects.catalogue import resolve_objects
+from dro_grasp.training.data.engine.schedule import own_pairs
+from lab.benchmarks.report import ROOT
+from lab.recipe import __main__ as recipe, pack
+from lab.recipe.__main__ import Attempt
+from lab.recipe.parts import fill, fingerprint
+from lab.recipe.steps import FULL, STAGES, TINY, Step
+from tests.helpers.weights import untrained_weights
+
+RUN = [sys.executable, "-m", "lab.recipe", *STAGES, "--tiny", "--device", "cpu", "--workers", "2", "--folder"]
+
+
+def attempt(folder: Path, command: str, makes: Path, *reads: Path) -> Attempt:
+    return Attempt(Step("one", command, str(makes), tuple(map(str, reads))), str(folder), 1, "cpu", None)
+
+
+def test_a_step_is_run_once_and_again_for_another_command_or_other_files(tmp_path: Path) -> None:
+    source, made, seen = tmp_path / "source", tmp_path / "made", tmp_path / "seen"
+    source.write_text("a")
+    script = tmp_path / "step.py"
+    script.write_text(f"import pathlib, sys\npathlib.Path({str(made)!r}).touch()\nwith open({str(seen)!r}, 'a') as file:\n"
+                      "    file.write(sys.argv[2])\n")
+
+    def run(option: str) -> int:
+        return attempt(tmp_path, f"python {script} {option} {{run}}", made, source).run()
+
+    assert (run("x"), run("x")) == (0, 0)
+    folders = seen.read_text()
+    assert folders.count("runs/one-") == 1
+    source.write_text("b")
+    assert run("x") == 0
+    assert run("y") == 0
+    made.unlink()
+    assert run("y") == 0
+    ran = seen.read_text().split(str(tmp_path))[1:]
+    assert len(ran) == 4
+    assert len(set(ran)) == 3  # a folder of its own for other files and another command
+    assert json.loads((tmp_path / recipe.RECORD).read_text())["one"]["read"] == fingerprint([source])
+
+
+def test_a_step_that_fails_ends_the_run_with_its_code_and_is_not_done(tmp_path: Path) -> None:
+    step = attempt(tmp_path, "python -c 'raise SystemExit(3)'", tmp_path / "made")
+    assert step.run() == 3
+    (tmp_path / "made").touch()
+    assert not step.done()
+
+
+@pytest.mark.parametrize("size", [FULL, TINY])
+def test_each_step_names_a_seed_or_draws_nothing(size) -> None:
+    steps = [step for stage in STAGES.values() for step in stage(size, "out")]
+    assert len({step.name for step in steps}) == len(steps)
+    unseeded = ("dataset", "lab.benchmarks.data_card", "lab.recipe.pack", "lab.recipe.holding")  # the last has one of its own
+    for step in steps:
+        assert " --seed " in step.command or any(word in step.command for word in unseeded), step.name
+        assert "{minutes}" not in step.free or step.share > 0
+
+
+def test_the_data_are_what_a_release_asks_for() -> None:
+    assert len(FULL.hands) == 10
+    assert FULL.made >= 100
+    assert {"assets:train", "builtin:train", "builtin:hard_train"} <= set(FULL.known)
+    first, last = map(int, FULL.procedural.removeprefix("procedural:").split("-"))
+    assert last - first + 1 >= 400
+    assert sum(step.share for step in STAGES["data"](FULL, "out")) == pytest.approx(1)
+
+
+def test_made_up_hands_share_all_objects_among_them() -> None:
+    objects = resolve_objects([*(name for name in FULL.known if not name.startswith("assets")), FULL.procedural])
+    for more in ([], [f"asset {k}" for k in range(48)]):  # the paper's training objects, where they are at hand
+        part, parts = map(int, FULL.part.split("/"))
+        pairs = own_pairs([str(k) for k in range(FULL.made)], [*more, *objects], (part, parts))
+        assert {hand for hand, _ in pairs} == {str(k) for k in range(FULL.made)}
+        assert {obj for _, obj in pairs} == {*more, *objects}
+
+
+def make(shared: int, given: int) -> tuple[int, str]:
+    if given == 2:
+        raise ValueError("two is refused")
+    return shared + given, f"made {given}"
+
+
+def test_parts_are_made_whole_once_and_one_that_fails_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import torch
+
+    tasks = [(tmp_path / f"{k}.pt", k) for k in range(4)]
+    (tmp_path / "3.pt").write_text("kept")
+    fill(make, 10, tasks, workers=2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.pt", "1.pt", "3.pt"]
+    assert torch.load(tmp_path / "1.pt") == 11
+    told = capsys.readouterr().out
+    assert "2: ValueError: two is refused" in told
+    assert "1: made 1, 0 s" in told
+
+
+def test_weights_that_do_not_say_how_they_were_made_do_not_ship(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in pack.SET:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        untrained_weights((tmp_path / name).parent).rename(tmp_path / f"{name}.safetensors")
+    assert pack.main([str(tmp_path), "--into", str(tmp_path / "shipped")]) == 1
+    assert "lacks stage, command, commit, version, samples, metrics, data.fingerprint" in capsys.readouterr().err
+    assert not (tmp_path / "shipped").exists()
+
+
+def killed_in(step: str, folder: Path) -> bool:
+    """Start the recipe, and kill it a moment after a step has begun; whether the step ran."""
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    run = subprocess.Popen([*RUN, str(folder)], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    for line in run.stdout:
+        if line.startswith(f"{step}: ") and "done before" not in line:
+            time.sleep(0.5 if step == "set" else 2.5)  # the last one is over in three seconds
+            run.send_signal(signal.SIGKILL)
+            break
+    run.stdout.close()
+    return run.wait(60) == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_the_whole_recipe_survives_a_kill_in_each_step(tmp_path: Path) -> None:
+    steps = [step.name for stage in STAGES.values() for step in stage(TINY, str(tmp_path))]
+    assert [name for name in steps if not killed_in(name, tmp_path)] == []
+    done = subprocess.run([*RUN, str(tmp_path)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    shipped = tmp_path / "weights" / "shipped"
+    assert (shipped / CHECKSUMS).read_text().count("\n") == 4
+    subprocess.run(["sha256sum", "--check", CHECKSUMS], cwd=shipped, check=True, capture_output=True)
+    stages = [entry["stage"] for entry in history_of(shipped / "more_objects.safetensors")]
+    assert stages == ["pretraining", "training", "placement"]
+    for name in pack.SET:
+        about = history_of(shipped / f"{name}.safetensors")[-1]
+        assert about["samples"] > 0
+        assert about["command"].startswith(("dro-grasp train", "python -m lab.recipe."))
+        assert about["metrics"]

@@ -1,0 +1,54 @@
+"""Targets: what is reached, what is not, and what nobody measured."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from lab import targets
+from lab.measurements import MEASUREMENTS
+from lab.reading import Results
+from lab.targets import Found, Target
+
+CELL = {"commit": "0123456789", "weights": {"a": "1"}, "code": {"b": "2"}}
+
+
+@pytest.mark.parametrize(("value", "least", "end"), [
+    (5.0, True, "reached"), (4.9, True, "**not reached**"), (5.0, False, "reached"), (5.1, False, "**not reached**")])
+def test_a_value_is_held_against_its_goal(value: float, least: bool, end: str, tmp_path: Path) -> None:
+    line = Target("x", "y", 5, lambda _: Found(value, f"{value}"), least, "s").line(Results(tmp_path))
+    assert line == ["x", "y", f"at {'least' if least else 'most'} 5 s", f"{value}", "", end]
+
+
+def test_what_nobody_measured_says_so(tmp_path: Path) -> None:
+    for target in targets.targets():
+        if target.subject != "hands":  # those are of the notebook
+            assert target.line(Results(tmp_path))[3:] == ["", "", "not measured"], target.what
+
+
+def test_a_rate_is_of_the_attempts_in_the_file(tmp_path: Path) -> None:
+    cells = {name: {**CELL, "command": command, "result": {"attempts": [
+        {"success": k < 3, "stage": "done"} for k in range(4)]}} for name, command in MEASUREMENTS["lifts"].cells.items()}
+    (tmp_path / "lifts.json").write_text(json.dumps({"cells": cells}))
+    (line,) = (t.line(Results(tmp_path)) for t in targets.targets() if t.what == "lifted, held and shaken, `ur5e_allegro`")
+    assert line[3:] == ["75.0 [60-86] of 40", "0123456789", "**not reached**"]
+
+
+def test_a_row_of_two_states_is_refused(tmp_path: Path) -> None:
+    cells = {name: {**CELL, "command": command, "weights": {"a": name}, "result": {"attempts": [
+        {"success": True, "stage": "done"}]}} for name, command in MEASUREMENTS["lifts"].cells.items()}
+    (tmp_path / "lifts.json").write_text(json.dumps({"cells": cells}))
+    with pytest.raises(ValueError, match="mix states: weights"):
+        targets.all_targets(Results(tmp_path))
+
+
+def test_published_hands_are_counted_in_their_last_state() -> None:
+    lines = list(csv.DictReader(targets.PUBLISHED.read_text().splitlines()))
+    hands = {line["hand"] for line in lines}
+    found = targets.published(Results(), ("accepted",))
+    last = [[line for line in lines if line["hand"] == hand][-1] for hand in hands]
+    assert found.value == sum(line["accepted"] == "yes" for line in last)
+    assert found.told.endswith(f"of {len(hands)}")
