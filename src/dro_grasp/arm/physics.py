@@ -43,6 +43,8 @@ FIXTURES = "fixtures"  # Name of the body of things that do not move
 SHAPE_GROUP = 4  # Group of the geoms that only cameras see: the objects' true meshes
 BALL_BIT = 2  # Bit of contacts of an estimated object's balls with the hand (ours)
 HULL_BIT = 4  # Bit of contacts of its convex hull with the table (ours)
+STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
+"""Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
 FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
@@ -201,14 +203,17 @@ def _add_thing(scene: mujoco.MjSpec, protocol: Protocol, obj: ObjectModel, index
 
 
 def _add_estimate(scene: mujoco.MjSpec, protocol: Protocol, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
-    """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put."""
+    """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put.
+
+    What is at rest has its centre of mass above its foot, however little of the underside was seen.
+    """
     solid, board = solid_of(obj), scene.geom(TABLE)
     body = add_object(scene, solid, protocol, object_name(index))
     for ball in body.geoms:
         ball.contype = ball.conaffinity = BALL_BIT
     cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
-    foot = cloud[cloud[:, 2] < cloud[:, 2].min() + 0.004] * (1, 1, 0) + (0, 0, height)  # what is within 4 mm of it (ours)
-    corners = np.concatenate([cloud, foot]) - solid.centre_of_mass
+    low, below = cloud[cloud[:, 2] < cloud[:, 2].min() + 0.004], solid.centre_of_mass + STEADY  # within 4 mm of it (ours)
+    corners = np.concatenate([cloud, np.concatenate([low, below]) * (1, 1, 0) + (0, 0, height)]) - solid.centre_of_mass
     mesh = scene.add_mesh(name=f"hull{index}", uservert=corners[ConvexHull(corners).vertices].ravel())
     mesh.maxhullvert = HULL_VERTICES
     body.add_geom(

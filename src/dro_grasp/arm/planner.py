@@ -269,10 +269,8 @@ def trusted(task: Task, tries: Tries, whole: bool) -> list[Feasible]:
         return tries.share[number] >= least and score[number] >= surely
 
     ready = tries.taken()
-    # After a whole batch the best decides for all that can be reached, any of which a path may lead to.
-    goals = ready if whole and ready and enough(ready[0].index) else [goal for goal in ready if enough(goal.index)]
-    tries.ready = [goal for goal in ready if not any(goal is taken for taken in goals)]
-    return goals
+    tries.ready = [goal for goal in ready if not enough(goal.index)]
+    return [goal for goal in ready if enough(goal.index)]
 
 
 def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> MotionPlan | None:
