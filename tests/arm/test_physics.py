@@ -48,6 +48,22 @@ def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: d
     assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * solid_of(ball).volume)
 
 
+def test_what_lies_and_was_seen_from_one_side_stays_where_it_lies(robot: dro.Robot) -> None:
+    """Its lowest known points are then on the side of the camera, and not below its middle."""
+    mesh = trimesh.creation.cylinder(0.035, 0.12, transform=trimesh.transformations.rotation_matrix(math.pi / 2, (1, 0, 0)))
+    mesh.apply_translation((0.45, 0.0, 0.035))
+    whole = cloud_of(mesh, "roll")
+    normals = whole.cloud_normals
+    shown = (normals @ np.float32((0.8, 0.0, 0.6)) > -0.4) & (normals[:, 2] > -0.97) & (np.abs(normals[:, 1]) < 0.5)
+    part = replace(whole, cloud=whole.cloud[shown], cloud_normals=normals[shown])
+    lowest = part.cloud[part.cloud[:, 2] < part.cloud[:, 2].min() + 0.004]
+    assert lowest[:, 0].min() > part.centre_of_mass[0]
+    scene = LiftScene(Workcell(robot), [part])
+    scene.place(0, np.eye(4))
+    scene.advance(1.0)
+    assert np.abs(scene.pose(0) - np.eye(4)).max() < 2e-3
+
+
 @pytest.mark.parametrize("limits", ["-30 30", "10 40"], ids=["at zero", "away from zero"])
 def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_path: Path, limits: str) -> None:
     """As the two of the wrist of a Shadow hand; those at zero are no joints of the scene."""
