@@ -25,6 +25,7 @@ as a radian to each joint: 1, or a length where it slides [m]."""
 HoldState = Literal["held", "empty", "slipping"]
 STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")  # In the order of HoldConfig.priors
 STEPS = 10  # Shares of the way that are tried for a slipping object (ours)
+ONSETS = (0.0, 0.25, 0.5, 0.7, 0.85)  # Shares of the watched time after which a slip may begin (ours)
 FEWEST = 4  # Fewest rows of joints that show how fast they move (ours)
 MOST = 50.0  # Largest log-likelihood ratio of one joint (ours)
 STEADY = 1e-3  # Least noise of encoders [rad, or a share of a sliding joint's unit] (ours): no number is exact
@@ -70,7 +71,7 @@ class HoldConfig(Checked):
     """The least such share where nobody measured before: fingers that hold may stop as far from the expected place [1]."""
     priors: tuple[float, float, float] = (0.48, 0.48, 0.04)
     """Probabilities of held, empty and slipping before anything is measured."""
-    creep: float = 0.03
+    creep: float = 0.015
     """Standard deviation of how fast joints move of a hand that holds [rad/s, or likewise]."""
     slide: float = 0.2
     """The same of joints that move because an object slips."""
@@ -153,7 +154,10 @@ def _measured(name: str, given: ArrayLike, size: int) -> Float[np.ndarray, " n_d
 
 
 def _moves(watched: ArrayLike, seconds: float, unit: Float[np.ndarray, " n_dof"], config: HoldConfig) -> float:
-    """Log-likelihood ratio of joints that a slipping object moves, to those that rest, from rows at even times."""
+    """Log-likelihood ratio of joints that a slipping object moves, to those that rest, from rows at even times.
+
+    A slip begins at one of ONSETS. Speeds are means over the whole time.
+    """
     try:
         rows = np.asarray(watched, np.float64)
     except (TypeError, ValueError) as error:
@@ -162,13 +166,17 @@ def _moves(watched: ArrayLike, seconds: float, unit: Float[np.ndarray, " n_dof"]
     if not (fits and np.isfinite(rows).all() and 0 < seconds < math.inf):
         raise OptionError(f"watched has shape {rows.shape} over {seconds} s; give at least {FEWEST} rows, each of one finite "
                           f"number for each of the hand's {len(unit)} joints, and a time above 0")
-    rows, time = rows / unit, np.linspace(-seconds / 2, seconds / 2, len(rows))
-    speed = time @ rows / (time @ time)
-    rest = rows - rows.mean(0) - time[:, None] * speed
-    noise = max(STEADY, math.sqrt(float((rest**2).sum()) / (rest.size - 2 * len(unit)))) / math.sqrt(float(time @ time))
-    still, moving = math.hypot(noise, config.creep), math.hypot(noise, config.slide)
-    ratio = np.log(still / moving) + speed**2 / 2 * (still**-2 - moving**-2)
-    return float(np.log1p(config.share * np.expm1(np.minimum(ratio, MOST))).sum())
+    rows = (rows - rows.mean(0)) / unit
+    noise = max(STEADY, math.sqrt(float((np.diff(rows, 2, axis=0) ** 2).mean()) / 6))  # what is not smooth
+    ways = np.maximum(np.linspace(0, 1, len(rows)) - np.array(ONSETS)[:, None], 0)
+    ways *= seconds / (1 - np.array(ONSETS)[:, None])  # each as if it had gone as far in the whole time
+    ways -= ways.mean(1, keepdims=True)
+    size = (ways**2).sum(1)[:, None]
+    speed = ways @ rows / size
+    still, moving = noise**2 / size + config.creep**2, noise**2 / size + config.slide**2
+    ratio = np.log(still / moving) / 2 + speed**2 / 2 * (1 / still - 1 / moving)
+    each = np.log1p(config.share * np.expm1(np.minimum(ratio, MOST))).sum(1)
+    return float(np.logaddexp.reduce(each)) - math.log(len(ONSETS))
 
 
 def _log_likelihoods(
