@@ -30,7 +30,7 @@ PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right s
 
 
 def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator[GraspBatch]]:
-    """What makes grasps in the world's frame from a seed, as they become known."""
+    """What makes the grasps of a batch, in the world's frame, as they become known."""
     directions: Directions | Float[Tensor, "k 3"] = task.config.directions
     if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
         middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
@@ -40,9 +40,10 @@ def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator
         task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
     config, hand, obj, T = task.config, task.robot.hand, task.obj, task.T
 
-    def coming(seed: int) -> Iterator[GraspBatch]:
+    def coming(batch: int) -> Iterator[GraspBatch]:
         request = GraspRequest(
-            config.num, seed, config.candidates, source=config.source, least_confidence=config.least_confidence)
+            config.num, task.seed_of(batch), config.candidates, source=config.source,
+            least_confidence=task.least_confidence(batch))
         if isinstance(directions, str) and directions == "all":
             problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)))
             yield from (in_world(grasps, T) for grasps in predictor.rounds(problem, request))

@@ -170,9 +170,9 @@ def candidates(
     if isinstance(given, GraspBatch):
         yield from (given, None)
         return
-    make = predicted(task, predictor or GraspPredictor()) if given is None else lambda seed: iter([given(seed)])
+    make = predicted(task, predictor or GraspPredictor()) if given is None else lambda batch: iter([given(task.seed_of(batch))])
     for batch in range(task.config.batches):
-        coming = make(task.seed + 7919 * batch)  # far from the seeds of other plans
+        coming = make(batch)
         while True:
             with tries.watch("grasps"):
                 try:

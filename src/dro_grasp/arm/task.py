@@ -68,7 +68,10 @@ class PlanConfig(Checked):
     source: str | Source = AUTO
     """What proposes grasps, as in `GraspRequest`."""
     least_confidence: float | None = None
-    """Grasps that hold with less probability are not tried, as in `GraspRequest`."""
+    """Grasps that hold with less probability are not tried, as in `GraspRequest`. Where nothing is given and lifts are
+    rehearsed, `doubtful` replaces it once no grasp of a whole batch was trusted."""
+    doubtful: float = 0.05
+    """Probability of holding with which grasps are tried after all (ours): a rehearsed lift tells more about a lift."""
     best_seconds: float = 1.0
     """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
@@ -92,6 +95,7 @@ class PlanConfig(Checked):
         if self.constraints.direction is not None and self.directions != "all":
             raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
         check_confidence(self.least_confidence or 0.0)
+        check_confidence(self.doubtful)
         check_friction(self.friction)
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
@@ -167,6 +171,15 @@ class Task:
         """The simulated lift, where lifts are rehearsed."""
         wanted = self.config.rehearsals > 0 and self.config.order == "score" and self.robot.table is not None
         return Rehearsal(self.cell, self.config.deviations, friction=self.config.friction) if wanted else None
+
+    def seed_of(self, batch: int) -> int:
+        """Seed of a batch, far from those of other plans."""
+        return self.seed + 7919 * batch
+
+    def least_confidence(self, batch: int) -> float | None:
+        """Grasps of this batch that hold with less probability are not tried; None for what is usual."""
+        given = self.config.least_confidence
+        return self.config.doubtful if given is None and batch and self.rehearsal is not None else given
 
     def check_start(self) -> None:
         """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""

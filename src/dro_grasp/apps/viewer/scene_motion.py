@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 import threading
@@ -168,7 +169,7 @@ class RobotScenePage(ScenePage):
         """Grasps as the planner makes them, those first that the arm can carry out."""
         task = self._task(wish, found, None)
         task.check_start()
-        grasps = GraspBatch.concatenate([*predicted(task, self.predictor)(wish.seed)]).sorted_by_score()
+        grasps = GraspBatch.concatenate([*predicted(task, self.predictor)(0)]).sorted_by_score()
         self._still(wish)
         self._say(f"**Thing {wish.number + 1}**: which of {len(grasps)} grasps the arm can carry out ...")
         return self._ranked(wish, found, grasps, None, lifted=True)
@@ -236,12 +237,12 @@ class RobotScenePage(ScenePage):
 
     def _planned_any(self, offer: Offer, spot: tuple[float, ...] | None) -> MotionPlan:
         """The motion of the best grasp that works, of those in the list and of further ones."""
-        task, batches = self._task(offer.wish, offer.found, spot), iter([offer.grasps])
+        task, numbers = self._task(offer.wish, offer.found, spot), itertools.count()
         further = predicted(task, self.predictor)
 
-        def batch(seed: int) -> GraspBatch:
+        def batch(_: int) -> GraspBatch:
             self._still(offer.wish)
-            return next(batches, None) or GraspBatch.concatenate([*further(seed)])
+            return GraspBatch.concatenate([*further(number)]) if (number := next(numbers)) else offer.grasps
 
         return plan(task.robot, offer.found.obj, predictor=self.predictor, config=task.config, seed=offer.wish.seed,
                     grasps=batch, place=task.place)
