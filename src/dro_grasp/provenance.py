@@ -28,9 +28,9 @@ def this_command() -> str:
 def commit() -> str:
     """The commit of the clone that the package lies in, `+` behind it where its code is changed; empty without a clone."""
     try:
-        head = _git("rev-parse", "--short=10", "HEAD")
+        head = _git("rev-parse", "HEAD")[:10]
         _git("ls-files", "--error-unmatch", "--", __file__)  # fails where the package was copied into a clone of something else
-        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".")
+        changed = _git("status", "-s", "-uno", "--", ".")
     except (OSError, subprocess.SubprocessError):
         return ""
     return head + ("+" if changed else "")
