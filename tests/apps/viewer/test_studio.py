@@ -406,20 +406,19 @@ def test_pages_that_were_closed_leave_nothing_in_memory(studio: Studio) -> None:
         entered.set()
         return made
 
+    def left() -> int:
+        return sum(page() is not None for page in pages)
+
     served = StudioServer(make, free_port(), HOST)
     gc.disable()
     try:
-        for _ in range(4):
+        while len(pages) < 4 or (left() > 1 and len(pages) < 12):  # a page that was drawn as it closed goes with the next
             entered.clear()
             asyncio.run(visit(served.server.get_port(), entered))
             end = time.monotonic() + 60
             while served.studios and time.monotonic() < end:
                 time.sleep(0.05)
-        end = time.monotonic() + 10
-        while sum(page() is not None for page in pages) > 1 and time.monotonic() < end:
-            time.sleep(0.1)
-        assert len(pages) == 4
-        assert sum(page() is not None for page in pages) <= 1, "the last one may be on its way"
+        assert left() <= 1, f"{left()} of {len(pages)} closed pages are in memory; the last one may be on its way"
     finally:
         gc.enable()
         served.stop()
