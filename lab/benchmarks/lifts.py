@@ -21,7 +21,7 @@ import torch
 
 from dro_grasp.arm.attempts import Attempt, endings, failures, lifted, processor_seconds
 from dro_grasp.arm.reachability import Fault
-from dro_grasp.arm.robot import load_robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop

@@ -20,7 +20,8 @@ import torch
 from scipy.spatial import KDTree
 
 from dro_grasp.arm.motion import STAGES, MotionPlan
-from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses

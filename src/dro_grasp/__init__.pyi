@@ -10,8 +10,9 @@ from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_c
 from .arm.picks import Pick as Pick
 from .arm.planner import plan as plan
 from .arm.reachability import ReachConfig as ReachConfig
-from .arm.robot import Robot as Robot, load_robot as load_robot
+from .arm.robot import Robot as Robot
 from .arm.robot_check import RobotReport as RobotReport, check_robot as check_robot
+from .arm.robot_loading import load_robot as load_robot
 from .arm.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from .arm.tabletop import TabletopConfig as TabletopConfig
 from .arm.tabletop_run import TabletopRun as TabletopRun, run_tabletop as run_tabletop

@@ -17,8 +17,8 @@ import yaml
 import dro_grasp as dro
 from dro_grasp.arm.drivers import Drivers
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.robot import load_robot
 from dro_grasp.arm.robot_check import check_robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.errors import RobotError
 from tests.helpers.robot_files import written, xarm7
 from tests.helpers.strange_hands import block, robot as whole, sliding

@@ -23,7 +23,7 @@ import dro_grasp as dro
 import dro_grasp.arm.robot as dro_robot
 from dro_grasp.arm.motion import STAGES, MotionPlan
 from dro_grasp.arm.planner import ALIKE, ALIKE_TURN, failed_before, plan
-from dro_grasp.arm.robot import BUILTIN_ROBOTS
+from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS
 from dro_grasp.arm.task import PlanConfig, Task
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.cli.main import main

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 from dro_grasp.arm.reachability import STEEPEST, TURNED, Fault, Reachability, ReachConfig, WristSolver, reachable_directions
-from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.workcell import Workcell
 from tests.helpers.claw_urdf import PALM, joint, link
 

@@ -13,7 +13,8 @@ import torch
 import yaml
 
 import dro_grasp as dro
-from dro_grasp.arm.robot import BUILTIN_ROBOTS, Robot, load_robot, robot_names
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS, load_robot, robot_names
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.cli.main import main
 from dro_grasp.errors import RobotError

@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 import dro_grasp as dro
 from dro_grasp.arm.candidates import grasps_in_world
 from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.robot import load_robot
 from dro_grasp.arm.robot_check import check_robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.task import PlanConfig
 from dro_grasp.arm.workcell import VOXEL, Workcell, occupied, scene_solid
 from dro_grasp.cli.main import main

@@ -13,8 +13,9 @@ from PIL import Image
 from dro_grasp.arm.attempts import Attempt
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.robot import Robot, Table, load_robot
+from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import Watcher, attempt
 from dro_grasp.arm.tabletop_run import TabletopRun

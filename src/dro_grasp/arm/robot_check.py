@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from dro_grasp.arm.robot import Robot, Table, load_robot
+from dro_grasp.arm.robot import Robot, Table
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour, Mesh, arrow, render

@@ -11,7 +11,7 @@ from typing import Any
 
 from dro_grasp.arm.attempts import Attempt, read_attempts, write_attempts
 from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.robot import load_robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.table_scene import PickedObject
 from dro_grasp.arm.tabletop import TabletopConfig, Watcher, attempt
 from dro_grasp.devices import one_thread

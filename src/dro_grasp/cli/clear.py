@@ -58,7 +58,7 @@ class Clear:
         from dro_grasp.arm.animation import FORMATS
         from dro_grasp.arm.clear_record import ClearRecorder
         from dro_grasp.arm.clearing_trial import clear_trial
-        from dro_grasp.arm.robot import load_robot
+        from dro_grasp.arm.robot_loading import load_robot
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output

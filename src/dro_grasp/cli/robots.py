@@ -105,7 +105,7 @@ class Plan:
         from dro_grasp.arm.flat_plans import plan_or_slide
         from dro_grasp.arm.placing import Place
         from dro_grasp.arm.planner import plan
-        from dro_grasp.arm.robot import load_robot
+        from dro_grasp.arm.robot_loading import load_robot
         from dro_grasp.arm.task import PlanConfig
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
@@ -390,7 +390,7 @@ class Robots:
 
     def run(self) -> int:
         """Print the names."""
-        from dro_grasp.arm.robot import robot_names
+        from dro_grasp.arm.robot_loading import robot_names
 
         names = robot_names()
         print_result(self.json, {"robots": names}, "robots", ["name"], [[n] for n in names], "also: the path of a robot.yaml")

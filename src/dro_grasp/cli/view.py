@@ -125,7 +125,7 @@ class View:
         else:
             require_extra("arm")
             from dro_grasp.apps.viewer.scene_motion import RobotScenePage
-            from dro_grasp.arm.robot import load_robot
+            from dro_grasp.arm.robot_loading import load_robot
             from dro_grasp.errors import OptionError
 
             robot = load_robot(self.robot)

@@ -16,7 +16,8 @@ from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage,
 from dro_grasp.arm.animation import VIEW, Recorder, colour_of
 from dro_grasp.arm.attempts import Attempt, read_attempts
 from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan
-from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.tabletop import TabletopConfig, attempt
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
