@@ -30,6 +30,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from dro_grasp.files import replacing
+from dro_grasp.provenance import commit
 from lab.benchmarks.report import ROOT, machine
 from lab.measurements import CORE, MEASUREMENTS, PREPARATIONS, PREPARED, Measurement
 
@@ -259,11 +260,6 @@ def uncommitted() -> list[str]:
     """Files of code, data and weights that differ from the commit."""
     lines = git("status", "--porcelain", "--", "src", "lab", "data").splitlines()
     return [line[3:] for line in lines if not line[3:].startswith(("lab/results", "lab/notebook"))]
-
-
-def commit() -> str:
-    """The commit that is checked out."""
-    return git("rev-parse", "--short=10", "HEAD").strip()
 
 
 if __name__ == "__main__":

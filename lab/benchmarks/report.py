@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from dro_grasp.cli.output import print_json
 from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.provenance import commit
 
 ROOT = Path(__file__).resolve().parents[2]
 """Folder of the repository."""
@@ -31,7 +31,7 @@ def machine() -> dict[str, str | int]:
         "torch": torch.__version__,
         "mujoco": _version("mujoco"),
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
-        "commit": _commit(),
+        "commit": commit() or "unknown",
     }
 
 
@@ -99,12 +99,3 @@ def _cpu_model() -> str:
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def _commit() -> str:
-    try:
-        return subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
