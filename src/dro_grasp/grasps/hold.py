@@ -2,7 +2,7 @@
 
 Fingers that close on an object stop where it is, and press; fingers that close on nothing go on to their targets. Both ends are
 known from closings in simulation (`expect_hold`). Fingers from which an object slips move while it does, and only then: whoever
-watches them for a fifth of a second sees it. Ours.
+watches them for a fifth of a second sees it, unless the object slides along fingers that rest. Ours.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ ONSETS = (0.0, 0.25, 0.5, 0.7, 0.85)  # Shares of the watched time after which a
 FEWEST = 4  # Fewest rows of joints that show how fast they move (ours)
 MOST = 50.0  # Largest log-likelihood ratio of one joint (ours)
 STEADY = 1e-3  # Least noise of encoders [rad, or a share of a sliding joint's unit] (ours): no number is exact
+SPREADS = ("encoder", "sensor", "spread", "slack", "creep", "slide", "scale", "heavy")  # Of HoldConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +108,13 @@ class HoldConfig(Checked):
                               "probabilities between 0 and 1")
 
 
-SPREADS = ("encoder", "sensor", "spread", "slack", "creep", "slide", "scale", "heavy")  # Of HoldConfig
-
-
 @dataclass(frozen=True)
 class HoldCheck:
     """What the joints say."""
 
     state: HoldState
-    """The most probable state."""
+    """The most probable state: *held* is what rests in the hand, *slipping* what has left its place by a centimetre or more and
+    goes on at 2 cm/s or more; *empty* is a hand that has closed on nothing."""
     confidence: float
     """Its probability."""
     probabilities: dict[str, float]
@@ -129,8 +128,9 @@ def check_hold(
 ) -> HoldCheck:
     """Compare measured joints, and efforts if there are any, with those that are expected with the object and without.
 
-    Measure once the hand has squeezed, and again after the lift. Where joints end at the same place with the object and
-    without, the confidence is low, and efforts are needed.
+    Measure after the lift, best for a fifth of a second (`watched`). Where joints end at the same place with the object and
+    without, the confidence is low, and efforts or a load are needed. Slow motion of the object
+    is neither held nor slipping.
 
     Args:
         expected: What to expect, of a plan (`MotionPlan.hold`) or of grasps (`HoldExpectation.of`).
@@ -138,13 +138,13 @@ def check_hold(
         measured_efforts: What they exert, likewise [Nm or N], positive toward larger values.
         before: Joints as they were measured while the object was held, likewise: how they moved since shows that it slips.
         watched: Joints that were measured one after the other at even times while nothing was commanded, up to now,
-            (k, n_dof), 4 rows at least: that they move shows that it slips.
+            (k, n_dof), 4 rows at least: that they move shows that it slips. Where they are is their mean.
         seconds: Time from the first to the last of these [s].
-        load: How much more the wrist carries than before the hand closed [N].
+        load: How much more the wrist carries than before the hand closed [N], for which the object's weight has to be expected.
         config: Spreads.
 
     Raises:
-        OptionError: Measurements have another shape, or are not finite.
+        OptionError: Measurements have another shape, or are not finite; a load is given, and no weight is expected.
     """
     config, size = config or HoldConfig(), len(expected.held_joints)
     joints, held = _measured("measured_joints", measured_joints, size), expected.held_joints
