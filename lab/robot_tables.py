@@ -15,8 +15,8 @@ TASKS = {"lifts": "lifted, held and shaken", "asked": "the same, of the one aske
 """Measurements of attempts, and what they are called."""
 LIFTED = {*PLACING, "place", "done"}
 """Where attempts with a place end whose object was in the air."""
-HELD_BY = "watched"
-"""What is measured of hands that may hold, in `lab.benchmarks.hold_check`."""
+HELD_BY, HOLD_NOISES = "watched", ("typical", "pessimistic")
+"""What is measured of hands that may hold, and with what noise, in `lab.benchmarks.hold_check`."""
 
 
 def robot_tasks(results: Results) -> str:
@@ -40,14 +40,21 @@ def robot_tasks(results: Results) -> str:
         good = sum(a["success"] for a in tried)
         lines.append(counts(f"flat and thin things lifted, held and shaken, `{robot}`", "flat_lifts", len(tried), good,
                             len(tried), ended))
-    right, n = Counter[str](), Counter[str]()
-    for row in (row for cell in results.some("holding") for row in cell["rows"]):
-        if row["hand"] != "all" and row["measured"] == HELD_BY:
-            right[row["truth"]] += row[row["truth"]]
-            n[row["truth"]] += row["n"]
-    also = ", ".join(f"{truth} {right[truth]} of {n[truth]}" for truth in n)
-    lines.append(counts("held, empty or slipping, by the joints", "holding", n.total(), right.total(), n.total(), also))
+    for noise in HOLD_NOISES:
+        right, n = Counter[str](), Counter[str]()
+        for row in hold_rows(results, noise):
+            right[row["kind"]] += row[row["truth"]]
+            n[row["kind"]] += row["n"]
+        also = ", ".join(f"{kind} {right[kind]} of {n[kind]}" for kind in n)
+        text = f"held, empty or slipping, by the joints, {noise} noise"
+        lines.append(counts(text, "holding", n.total(), right.total(), n.total(), also))
     return table(["", "asked", "counted", "reached [%]", "ended in"], lines)
+
+
+def hold_rows(results: Results, noise: str) -> list[dict[str, Any]]:
+    """Judgements by the joints with this noise, by hand and kind."""
+    return [row for cell in results.some("holding") for row in cell["rows"]
+            if row["hand"] != "all" and row["measured"] == HELD_BY and row["noise"] == noise]
 
 
 def attempts(results: Results, measurement: str, robot: str) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from lab.benchmarks import gpu_table
 from lab.benchmarks.report import ROOT
 from lab.measurements import FLAT_THINGS, PAPER_HANDS, ROBOTS
 from lab.reading import MissingResult, Results, as_row, mixed, percent, plain, select, table
-from lab.robot_tables import HELD_BY, LIFTED, attempts
+from lab.robot_tables import HOLD_NOISES, LIFTED, attempts, hold_rows
 
 PUBLISHED = ROOT / "lab" / "notebook" / "2026-11-published-hands.csv"
 """Twenty-four published hands, judged from pictures one by one."""
@@ -158,9 +158,8 @@ def picks(results: Results) -> Found:
 
 
 def holding(results: Results) -> Found:
-    """Judgements by the joints that are right."""
-    rows = [row for cell in results.some("holding") for row in cell["rows"]
-            if row["hand"] != "all" and row["measured"] == HELD_BY]
+    """Judgements by the joints, with the noise that hands have, that are right."""
+    rows = hold_rows(results, HOLD_NOISES[0])
     return counted(sum(row[row["truth"]] for row in rows), sum(row["n"] for row in rows))
 
 

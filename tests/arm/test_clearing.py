@@ -87,7 +87,7 @@ def world(monkeypatch: pytest.MonkeyPatch, robot: dro.Robot, placed: MotionPlan)
             return placed
 
         def check(self: MotionPlan, joints: np.ndarray, *, watched: np.ndarray, seconds: float) -> Any:
-            assert watched.shape == (11, len(joints))
+            assert watched.shape == (21, len(joints))
             assert seconds == pytest.approx(0.2)
             held = table.holds.pop(0)
             if isinstance(held, str):

@@ -169,9 +169,12 @@ def test_a_plan_says_what_to_expect_of_the_hold_and_checks_it(planned: MotionPla
     np.testing.assert_allclose(expected.empty_joints, planned.hand.position[-1], atol=0.15)
     assert planned.check_hold(expected.held_joints, expected.held_efforts).state == "held"
     assert planned.check_hold(expected.empty_joints, expected.empty_efforts).state == "empty"
+    assert expected.weight is not None
+    assert planned.check_hold(expected.held_joints, expected.held_efforts, load=expected.weight).state == "held"
     planned.save(tmp_path / "plan.npz")
     again = MotionPlan.load(tmp_path / "plan.npz")
     assert again.notes == planned.notes
+    assert f"# The object should weigh {expected.weight:.3g} N." in dro.trajectory_yaml(planned)
     messages = yaml.load(dro.trajectory_yaml(planned), yaml.CSafeLoader)
     for name, joints, efforts in (("held", expected.held_joints, expected.held_efforts),
                                   ("empty", expected.empty_joints, expected.empty_efforts)):

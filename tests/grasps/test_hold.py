@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal, norm
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.hold import HoldConfig, HoldExpectation, check_hold
@@ -105,7 +106,8 @@ def test_measurements_that_do_not_fit_are_refused() -> None:
             check_hold(EXPECTED, EXPECTED.held_joints, watched=wrong)
     with pytest.raises(OptionError, match="a time above 0"):
         check_hold(EXPECTED, EXPECTED.held_joints, watched=np.zeros((11, 4)), seconds=0.0)
-    for settings in ({"encoder": 0.0}, {"slide": 0.0}, {"share": 1.0}, {"spread": -1.0}, {"priors": (1.0, 0.0, 0.0)}):
+    for settings in ({"encoder": 0.0}, {"slide": 0.0}, {"share": 1.0}, {"spread": -1.0}, {"slack": 0.0},
+                     {"scale": 0.0}, {"heavy": float("inf")}, {"doubt": 1.0}, {"priors": (1.0, 0.0, 0.0)}):
         with pytest.raises(OptionError, match="give"):
             HoldConfig(**settings)
 
@@ -120,3 +122,60 @@ def test_a_slip_that_has_just_begun_is_seen_and_rest_is_not_taken_for_one() -> N
             rows = EXPECTED.held_joints + EXPECTED.unit * (way + noise)
             right[state] += check_hold(EXPECTED, rows[-1], watched=rows).state == state
     assert min(right.values()) >= 98, right
+
+
+def test_fingers_that_stop_far_from_both_places_hold_something() -> None:
+    """The object stands a few millimetres off where the plan has it; nobody knows which way."""
+    near = HoldExpectation(
+        EXPECTED.held_joints, np.zeros(4), EXPECTED.held_joints + 0.01 * EXPECTED.unit, np.zeros(4), EXPECTED.unit)
+    for side in (-1.0, 1.0):
+        check = check_hold(near, near.held_joints + side * np.array([0.1, 0.08, 0.0, 0.0]))
+        assert (check.state, check.confidence > 0.9) == ("held", True), side
+
+
+def test_the_load_decides_where_joints_say_nothing_and_the_object_is_heavy() -> None:
+    blind = HoldExpectation(EXPECTED.held_joints, np.zeros(4), EXPECTED.held_joints, np.zeros(4), EXPECTED.unit, weight=5.0)
+    for load, state in ((5.0, "held"), (3.0, "held"), (40.0, "held"), (0.0, "empty"), (-0.5, "empty")):
+        check = check_hold(blind, blind.held_joints, load=load)
+        assert (check.state, check.confidence > 0.85) == (state, True), load
+    light = HoldExpectation(EXPECTED.held_joints, np.zeros(4), EXPECTED.held_joints, np.zeros(4), EXPECTED.unit, weight=0.1)
+    assert check_hold(light, light.held_joints, load=0.1).confidence < 0.6, "sensors do not feel 10 g"
+    assert check_hold(light, light.held_joints, load=0.1, config=HoldConfig(scale=0.01)).state == "held"
+    for expected, load in ((EXPECTED, 1.0), (blind, float("nan"))):
+        with pytest.raises(OptionError, match="how heavy the object is"):
+            check_hold(expected, expected.held_joints, load=load)
+
+
+def test_a_load_counts_as_a_gaussian_of_known_spreads() -> None:
+    """The odds of held and empty by hand: joints say nothing, and the spread of the weight adds to that of the sensor."""
+    blind = HoldExpectation(EXPECTED.held_joints, np.zeros(4), EXPECTED.held_joints, np.zeros(4), EXPECTED.unit, weight=2.0)
+    config = HoldConfig(scale=0.5, heavy=0.6, doubt=1e-12)
+    for load in (0.3, 0.9, 1.6):
+        found = check_hold(blind, blind.held_joints, load=load, config=config).probabilities
+        odds = norm.logpdf(load, 2.0, np.hypot(0.5, 0.6 * 2.0)) - norm.logpdf(load, 0.0, 0.5)
+        assert np.log(found["held"] / found["empty"]) == pytest.approx(odds, abs=1e-6)
+
+
+def test_moving_joints_are_judged_as_gaussian_processes() -> None:
+    """The odds of slipping and held by SciPy's normal density, for one joint."""
+    one = HoldExpectation(np.array([0.5]), np.zeros(1), np.array([0.9]), np.zeros(1), np.ones(1))
+    rng, time, config = np.random.default_rng(1), np.linspace(-0.1, 0.1, 21), HoldConfig(doubt=1e-12)
+    rows = 0.5 + 0.05 * np.maximum(time, 0) + 0.002 * rng.normal(size=21)
+    noise = np.sqrt((np.diff(rows, 2) ** 2).mean() / 6)
+    still = noise**2 * np.eye(21) + config.creep**2 * np.outer(time, time)
+    ratios = []
+    for onset in (0.0, 0.25, 0.5, 0.7, 0.85):
+        way = np.maximum(np.linspace(0, 1, 21) - onset, 0) / (1 - onset) * 0.2
+        way -= way.mean()
+        moving = multivariate_normal.logpdf(rows - rows.mean(), cov=still + config.slide**2 * np.outer(way, way))
+        ratio = np.exp(moving - multivariate_normal.logpdf(rows - rows.mean(), cov=still))
+        ratios.append(1 - config.share + config.share * ratio)
+    found = check_hold(one, rows[-1:], watched=rows[:, None], seconds=0.2, config=config).probabilities
+    prior = np.log(config.priors[2] / config.priors[0])
+    assert np.log(found["slipping"] / found["held"]) == pytest.approx(prior + np.log(np.mean(ratios)), abs=1e-6)
+
+
+def test_nothing_is_surer_than_doubt_allows() -> None:
+    check = check_hold(EXPECTED, between(0.0), EXPECTED.held_efforts, config=HoldConfig(doubt=0.3))
+    assert check.confidence == pytest.approx(0.8, abs=1e-3)
+    assert sum(check.probabilities.values()) == pytest.approx(1)

@@ -69,6 +69,7 @@ def test_columns_travel_in_files_and_nothing_is_known_without_them(grasps: Grasp
     assert again is not None
     assert expected is not None
     np.testing.assert_allclose(again.held_joints, expected.held_joints, atol=1e-6)
+    assert again.weight == pytest.approx(9.81 * ball(RADIUS).mass, rel=1e-5)
     mixed = GraspBatch.concatenate([told, grasps])
     assert set(HOLD_COLUMNS) <= set(mixed.extra)
     assert HoldExpectation.of(mixed, len(told)) is None

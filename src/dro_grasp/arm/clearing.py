@@ -35,8 +35,8 @@ from dro_grasp.predict.predictor import GraspPredictor
 HOME_SECONDS = 5.0  # Longest time for a path home [s] (ours)
 WALL = 0.01  # Thickness of the bin's walls [m] (ours)
 BESIDE = 0.03  # Distance from the bin within which what is seen counts as the bin [m] (ours): its walls are seen with noise
-WATCHED = 11  # How often joints are measured to see whether something slips (ours)
-EVERY = 0.02  # Time between two of these [s] (ours)
+WATCHED = 21  # How often joints are measured to see whether something slips (ours)
+EVERY = 0.01  # Time between two of these [s] (ours)
 OPENING_SECONDS = 1.0  # Time in which a hand opens that holds nothing [s] (ours)
 
 

@@ -22,7 +22,7 @@ from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.export.writers import yaml_text
 from dro_grasp.grasps.forces import forces_in_words
-from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldCheck, HoldExpectation, check_hold
+from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN, HoldCheck, HoldExpectation, check_hold
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -107,7 +107,8 @@ class PlanNotes:
     slide: list[list[float]] | None = None
     """Motion of the object, 4x4 in the world [m], where it is pushed to the table's edge, not grasped; None otherwise."""
     hold: dict[str, tuple[float, ...]] | None = None
-    """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS."""
+    """Joints and efforts to expect after the lift, with the object in the hand and without, by the names in HOLD_COLUMNS, and
+    the object's weight [N] as WEIGHT_COLUMN."""
     T_world_held: list[list[float]] | None = None
     """Where the wrist would have taken hold of an object that does not shift as the hand closes, to have it in the hand as it
     is, by the rehearsal [m]; None in plans without a place."""
@@ -173,21 +174,25 @@ class MotionPlan:
     def hold(self) -> HoldExpectation | None:
         """Joints and efforts to expect after the lift, with the object in the hand and without; None in plans of before."""
         known = self.notes.hold
-        return None if known is None else HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS))
+        if known is None:
+            return None
+        return HoldExpectation(*(np.array(known[name], float) for name in HOLD_COLUMNS),
+                               weight=next(iter(known.get(WEIGHT_COLUMN, ())), None))
 
     def check_hold(
         self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *, before: ArrayLike | None = None,
-        watched: ArrayLike | None = None, seconds: float = 0.2,
+        watched: ArrayLike | None = None, seconds: float = 0.2, load: float | None = None,
     ) -> HoldCheck:
         """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
 
         Raises:
-            OptionError: Measurements have another shape, or are not finite.
+            OptionError: Measurements have another shape, or are not finite; a load is given, and the plan states no weight.
             PlanError: The plan was made before plans stated what to expect.
         """
         if (expected := self.hold) is None:
             raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
-        return check_hold(expected, measured_joints, measured_efforts, before=before, watched=watched, seconds=seconds)
+        return check_hold(
+            expected, measured_joints, measured_efforts, before=before, watched=watched, seconds=seconds, load=load)
 
     def part(self, stage: str) -> slice:
         """Rows of a stage, after the last row of the stage before; that row alone for a stage without motion."""
@@ -314,13 +319,13 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
     messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm.driven(of_arm)),
                 "hand": _message(notes.frame, notes.hand_joints, plan.hand.driven(of_hand),
                                  None if effort is None else of_hand.efforts(effort))}
-    told = forces_in_words(notes.payload, notes.squeeze_force)
+    told, hold = forces_in_words(notes.payload, notes.squeeze_force), plan.hold
     if notes.squeeze_torque is not None:
         messages["squeeze"] = {
             "header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
             "position": _plain(of_hand.positions(plan.squeeze)),
             "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
-    if (hold := plan.hold) is not None:
+    if hold is not None:
         for name, joints, forces in (("held", hold.held_joints, hold.held_efforts),
                                      ("empty", hold.empty_joints, hold.empty_efforts)):
             messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
@@ -329,6 +334,7 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
     does = "pushes" if notes.slide is not None else "lifts" if notes.place is None else "lifts and places"
     return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
+            + (f"# The object should weigh {hold.weight:.3g} N.\n" if hold is not None and hold.weight is not None else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
 
 

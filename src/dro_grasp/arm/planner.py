@@ -28,7 +28,7 @@ from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
-from dro_grasp.grasps.hold import HOLD_COLUMNS
+from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.admission import violations
@@ -336,7 +336,7 @@ def _described(
         None if effort is None else tuple(effort.double().tolist()), None if goal.put is None else goal.put.moved.tolist(),
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
         scales=None if robot.drivers.are_usual else robot.drivers.scales,
-        hold={name: tuple(expected.extra[name][0].double().tolist()) for name in HOLD_COLUMNS},
+        hold={name: tuple(expected.extra[name][0].double().reshape(-1).tolist()) for name in (*HOLD_COLUMNS, WEIGHT_COLUMN)},
         T_world_held=None if goal.put is None else goal.put.T_grasp.tolist())
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),

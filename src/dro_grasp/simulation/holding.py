@@ -10,13 +10,13 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import complete
-from dro_grasp.grasps.hold import HOLD_COLUMNS
+from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.simulation.payload import servo_torques
+from dro_grasp.simulation.payload import GRAVITY, servo_torques
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts
-from dro_grasp.simulation.scene import scene_of
+from dro_grasp.simulation.scene import object_mass, scene_of
 
 AWAY = 10.0  # How far the object is taken for a closing without it [m] (ours)
 
@@ -24,7 +24,7 @@ AWAY = 10.0  # How far the object is taken for a closing without it [m] (ours)
 def expect_hold(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "carry", *, workers: int | None = None
 ) -> GraspBatch:
-    """The grasps with what joints and efforts to expect with the object in the hand, and without: columns HOLD_COLUMNS.
+    """The grasps with what to expect with the object in the hand, and without: HOLD_COLUMNS and WEIGHT_COLUMN.
 
     Each grasp closes to its squeeze twice in simulation. Gravity on the fingers is left out.
 
@@ -47,7 +47,9 @@ def expect_hold(
         alone = Rollout(rollout.scene, part, workers or 1)
         rows = [*rest(rollout, part), *rest(alone, part, empty=True), hand.tree.joint_unit.expand(len(part), -1)]
         parts.append(torch.stack([row.float() for row in rows]))
-    return whole.replace(extra={**whole.extra, **dict(zip(HOLD_COLUMNS, torch.cat(parts, 1), strict=True))})
+    weight = torch.full((len(whole),), GRAVITY * object_mass(obj, rules))
+    return whole.replace(
+        extra={**whole.extra, **dict(zip(HOLD_COLUMNS, torch.cat(parts, 1), strict=True)), WEIGHT_COLUMN: weight})
 
 
 def closing_of(protocol: str | Protocol) -> Protocol:

@@ -12,7 +12,7 @@ import yaml
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.writers import Frame, csv_table, dexgraspbench, isaac_grasp
-from dro_grasp.grasps.hold import HOLD_COLUMNS
+from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.hands.hand import Hand
 from tests.grasps.export.test_forces import posed
 from tests.helpers.loaded_hands import loaded_hand
@@ -30,7 +30,7 @@ def told(hand: Hand) -> GraspBatch:
     rows = {name: 0.1 * (k + 1) + torch.zeros(2, hand.tree.n_dof) for k, name in enumerate(HOLD_COLUMNS)}
     for column in rows.values():
         column[1] = torch.nan
-    return grasps.replace(extra={**grasps.extra, **rows})
+    return grasps.replace(extra={**grasps.extra, **rows, WEIGHT_COLUMN: torch.tensor([1.5, torch.nan])})
 
 
 def test_expected_joints_and_efforts_are_in_every_file_that_has_a_place_for_them(hand: Hand, told: GraspBatch) -> None:
@@ -39,12 +39,16 @@ def test_expected_joints_and_efforts_are_in_every_file_that_has_a_place_for_them
     for k, name in enumerate(HOLD_COLUMNS[:4]):
         assert first[name] == dict.fromkeys(names, pytest.approx(0.1 * (k + 1)))
         assert name not in second
+    assert first["held_weight"] == 1.5
+    assert "held_weight" not in second
     known, unknown = dexgraspbench(told, Frame(), "", 1.0, hand)
     np.testing.assert_allclose(known["empty_joints"], 0.3)
-    assert "held_joints" not in unknown
+    assert known["held_weight"] == 1.5
+    assert not {"held_joints", "held_weight"} & set(unknown)
     text = csv_table(told, Frame(), hand)
     one, other = csv.DictReader(line for line in io.StringIO(text) if not line.startswith("#"))
     assert [float(one[f"held_torque:{joint}"]) for joint in names] == [0.2] * len(names)
+    assert (one["held_weight"], other["held_weight"]) == ("1.5", "")
     assert {other[f"held_torque:{joint}"] for joint in names} == {""}
 
 

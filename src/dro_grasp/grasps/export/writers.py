@@ -22,7 +22,7 @@ from dro_grasp.grasps import columns
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
-from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation
+from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN, HoldExpectation
 from dro_grasp.grasps.sources import camera_pose, frame_of
 from dro_grasp.hands.hand import Hand
 
@@ -117,9 +117,10 @@ def comment(grasps: GraspBatch, frame: Frame) -> str:
 
 
 def forces(grasps: GraspBatch, i: int) -> dict[str, float]:
-    """Payload [kg] and squeeze force [N] of a grasp, as far as they are known."""
-    return {name: plain(column[i:i + 1])[0] for name in columns.CARRYING
-            if bool((column := getattr(grasps, name))[i].isfinite())}
+    """Payload [kg] and squeeze force [N] of a grasp, and the object's weight [N], as far as they are known."""
+    known = {name: getattr(grasps, name) for name in columns.CARRYING}
+    known |= {name: column for name, column in grasps.extra.items() if name == WEIGHT_COLUMN}
+    return {name: plain(column[i:i + 1])[0] for name, column in known.items() if bool(column[i].isfinite())}
 
 
 def hold(grasps: GraspBatch, i: int) -> dict[str, Float[Tensor, " n_dof"]]:
@@ -276,16 +277,17 @@ def csv_table(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> str
     text.write(comment(grasps, frame))
     writer = csv.writer(text, lineterminator="\n")
     told = HOLD_COLUMNS[:4] if all(name in grasps.extra for name in HOLD_COLUMNS) else ()
+    weight = [grasps.extra[WEIGHT_COLUMN]] if WEIGHT_COLUMN in grasps.extra else []
     names = [f"{posture}:{joint}" for posture in (*joints, "effort", *told) for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
-                     "robustness", "fingers_in_contact", *columns.CARRYING, *names])
+                     "robustness", "fingers_in_contact", *columns.CARRYING, *names, *[WEIGHT_COLUMN] * len(weight)])
     for i in range(len(grasps)):
         writer.writerow([
             grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _cell(grasps.score[i]), _cell(grasps.energy[i]),
             int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
             *(_cell(getattr(grasps, name)[i]) for name in ("robustness", "fingers_in_contact", *columns.CARRYING)),
             *(value for values in joints.values() for value in plain(values[i])), *map(_cell, efforts[i]),
-            *(_cell(value) for name in told for value in grasps.extra[name][i]),
+            *(_cell(value) for name in told for value in grasps.extra[name][i]), *(_cell(column[i]) for column in weight),
         ])
     return text.getvalue()
 
