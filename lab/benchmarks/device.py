@@ -20,6 +20,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dro_grasp.devices import require_device
 from dro_grasp.hands.hand import Hand
@@ -27,7 +28,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig, RetryConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -42,6 +43,8 @@ PREDICTIONS = {"cpu": {ONE: (1, 2, 16), MANY: (4, 1, 4), SINGLE: (1, 1, 4)},
                "gpu": {ONE: (1, 64, 16), MANY: (64, 1, 16), SINGLE: (1, 1, 4)}}
 """Pairs, grasps of each, and candidates of each grasp."""
 STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
+ALL_AT_FIRST = RetryConfig(first=16)
+"""All candidates are asked for at once, where half are by default as long as these suffice."""
 SETTLED = (True, False)  # Whether candidates close in simulation
 DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
@@ -74,38 +77,48 @@ def objects(count: int) -> list[ObjectModel]:
     return again
 
 
+class Run(NamedTuple):
+    """What one prediction took."""
+
+    seconds: float
+    stages: dict[str, float]  # seconds of each
+    made: int  # candidates, which may be fewer or more than were asked for
+
+
 def predictions(device: str, repetitions: int, options: argparse.Namespace) -> list[list[object]]:
-    """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates a second."""
+    """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates made a second."""
     hand, rows = load_hand(HAND), []
     for settled in SETTLED[:1] if options.settled else SETTLED:
         finish = FinishConfig() if settled else FinishConfig(settle=None)
-        predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
+        predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish, retry=ALL_AT_FIRST))
         for name, (pairs, num, candidates) in PREDICTIONS[kind(device)].items():
-            models, count = objects(pairs), pairs * num * candidates
+            models = objects(pairs)
             request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)
             # Closing in simulation takes most of the time, and is timed once.
-            times = 1 if settled and count > SLOW else repetitions
+            times = 1 if settled and pairs * num * candidates > SLOW else repetitions
             warm = 1 if times == 1 else WARM_RUNS
             runs = [one_run(predictor, hand, models, replace(request, seed=seed)) for seed in range(warm + times)]
             kept = runs[warm:]
-            whole = statistics.median(seconds for seconds, _ in kept)
-            parts = [1e3 * statistics.median(stages[name] for _, stages in kept) / count for name in STAGES]
+            whole, count = (statistics.median(values) for values in ([run.seconds for run in kept], [run.made for run in kept]))
+            parts = [1e3 * statistics.median(run.stages[name] for run in kept) / count for name in STAGES]
             what = f"{pairs} x {num} x {candidates}, {'settled' if settled else 'scored'}"
             note(options.record, f"{name}, {'settled' if settled else 'scored'}", device=device, rate=count / whole,
-                 milliseconds=1e3 * whole, first=runs[0][0], stages=dict(zip(STAGES, parts, strict=True)), candidates=count)
-            rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{part:.3f}" for part in parts),
+                 milliseconds=1e3 * whole, first=runs[0].seconds, candidates=count,
+                 stages=dict(zip(STAGES, parts, strict=True)))
+            rows.append(said([what, device, f"{runs[0].seconds:.2f}", *(f"{part:.3f}" for part in parts),
                               f"{1e3 * whole / count:.3f}", f"{count / whole:.1f}"]))
     return rows
 
 
 def one_run(
     predictor: GraspPredictor, hand: Hand, models: list[ObjectModel], request: GraspRequest
-) -> tuple[float, dict[str, float]]:
-    """Seconds of one prediction of all objects, and of its stages."""
+) -> Run:
+    """One prediction of all objects."""
     begin = time.perf_counter()
     made = predictor.run_many(problems_of(hand, models, predictor.device, Constraints()), request)
     whole = time.perf_counter() - begin
-    return whole, {name: sum(one.seconds[name] for one in made if isinstance(one, Prediction)) for name in STAGES}
+    found = [one for one in made if isinstance(one, Prediction)]
+    return Run(whole, {name: sum(one.seconds[name] for one in found) for name in STAGES}, sum(one.candidates for one in found))
 
 
 SLOW = 100  # Candidates from which on closing in simulation is timed once

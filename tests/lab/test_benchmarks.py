@@ -18,13 +18,17 @@ from scipy.stats import ttest_rel
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict import predictor
+from dro_grasp.predict.config import RetryConfig
+from dro_grasp.predict.sources import source as sources
 from dro_grasp.predict.sources.controls import palm_facing_starts
+from dro_grasp.predict.sources.source import Asked, Candidates, Source
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
-from lab.benchmarks import agreement, data_card, dexgraspbench, dexgraspbench_official, gpu_table
+from lab.benchmarks import agreement, data_card, device, dexgraspbench, dexgraspbench_official, gpu_table
 from lab.benchmarks.report import note
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
@@ -156,6 +160,32 @@ def test_what_a_filter_keeps_is_counted_with_its_diversity(tmp_path: Path) -> No
         joints = batch.joints.double().numpy().std(0, ddof=1)
         wanted = [np.concatenate([wrist, joints]).mean(), wrist.mean(), joints.mean()]
         assert [float(told[name]) for name in names] == pytest.approx(wanted, abs=6e-4)
+
+
+def _noted(path: Path) -> dict[str, dict[str, float]]:
+    """What a benchmark appended to a file, by name."""
+    return {one["name"]: one for one in map(json.loads, path.read_text().splitlines())}
+
+
+@pytest.mark.parametrize("first", [2, 16])
+def test_candidates_a_second_are_of_those_that_were_made(first: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sixteen that may be made, half settle where all are not asked for at first: counts are the sources' own."""
+    made, propose = [], sources.ask_all
+
+    def counted(source: Source, asked: list[Asked], *given: object) -> list[Candidates]:
+        made.append(sum(one.num for one in asked))
+        return propose(source, asked, *given)
+
+    monkeypatch.setattr(predictor, "ask_all", counted)
+    monkeypatch.setattr(device, "PREDICTIONS", {"cpu": {device.ONE: (1, 4, 4)}})
+    for name, value in (("HAND", "gripper3"), ("OBJECT", "sphere"), ("ALL_AT_FIRST", RetryConfig(first=first))):
+        monkeypatch.setattr(device, name, value)
+    options = SimpleNamespace(settled=True, record=tmp_path / "rows.jsonl")
+    ((_, _, _, *_, rate),) = device.predictions("cpu", 1, options)
+    one, = _noted(options.record).values()
+    assert one["candidates"] == sum(made[len(made) // 2:]) == {2: 8, 16: 16}[first]
+    assert one["rate"] == pytest.approx(1e3 * one["candidates"] / one["milliseconds"])
+    assert float(rate) == pytest.approx(one["rate"], abs=0.06)
 
 
 def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_noted(
