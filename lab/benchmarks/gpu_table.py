@@ -6,6 +6,7 @@ is blank.
 
     python -m lab.benchmarks.gpu_table [--device cuda] [--minutes 8] [--record out/gpu.jsonl] [--show] [--json]
 
+Agreement of verdicts needs development assets; `lab.benchmarks.device_trials --pack FOLDER` copies the few of them.
 `--device cpu` rehearses it in small, without a GPU; `--show` measures nothing.
 """
 

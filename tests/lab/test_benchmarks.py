@@ -17,7 +17,7 @@ from scipy.stats import ttest_rel
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.network.presets import PRESETS
-from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict import predictor
 from dro_grasp.predict.config import RetryConfig
 from dro_grasp.predict.sources import source as sources
@@ -28,8 +28,8 @@ from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
-from lab.benchmarks import agreement, data_card, device, dexgraspbench, dexgraspbench_official, gpu_table
-from lab.benchmarks.report import note
+from lab.benchmarks import agreement, data_card, device, device_trials, dexgraspbench, dexgraspbench_official, gpu_table
+from lab.benchmarks.report import ROOT, note
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -186,6 +186,28 @@ def test_candidates_a_second_are_of_those_that_were_made(first: int, tmp_path: P
     assert one["candidates"] == sum(made[len(made) // 2:]) == {2: 8, 16: 16}[first]
     assert one["rate"] == pytest.approx(1e3 * one["candidates"] / one["milliseconds"])
     assert float(rate) == pytest.approx(one["rate"], abs=0.06)
+
+
+@pytest.mark.parametrize("path", device_trials.FILES, ids=lambda path: path.stem)
+def test_stored_grasps_of_each_hand_are_as_many_as_the_table_wants(path: Path) -> None:
+    grasps = GraspBatch.load(ROOT / path)
+    found = list(device_trials.shares(grasps, 400))
+    rows = torch.cat([rows for _, rows in found])
+    assert len(rows) == len(rows.unique()) == 400
+    assert {grasps.split[row] for row in rows.tolist()} == {"train"}
+    assert [grasps.object[row] for row in rows.tolist()] == [name for name, own in found for _ in own]
+
+
+@pytest.mark.assets
+def test_what_agreement_needs_of_the_assets_goes_to_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    names = [name for name, _ in device_trials.shares(GraspBatch.load(device_trials.FILES[0]), 100)]
+    expected = [load_object(name) for name in names]
+    device_trials.main(["--grasps", str(device_trials.FILES[0]), "--num", "100", "--pack", str(tmp_path)])
+    monkeypatch.setenv("DRO_GRASP_ASSETS", str(tmp_path))
+    assert resolve_objects(["assets:train"]) == sorted(names)
+    for one, own in zip(expected, map(load_object, names), strict=True):
+        assert (one.sha256, one.split, len(one.parts)) == (own.sha256, own.split, len(own.parts))
 
 
 def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_noted(
