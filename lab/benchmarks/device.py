@@ -3,7 +3,8 @@
 Hands and objects are built in. Prediction is of candidates of the network alone, sixteen for each grasp that is returned: many
 of one pair, some of many pairs of one hand, and the four of which one grasp is chosen, by stage, with settling and without. The
 first run, which captures graphs, is told apart. Many pairs are of sixteen objects, each of which comes four times as an object
-of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process. Training is measured by
+of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process: what is `strict`-valid
+and confirmed, of training objects that are prepared before. Training is measured by
 `lab.benchmarks.training`, and all of it in a few minutes by `lab.benchmarks.gpu_table`.
 
     python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--settled] [--alone] [--quick]
@@ -50,6 +51,9 @@ DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 SHARES = {"cpu": (1.0,), "gpu": (1.0, 0.1)}
 """Shares of what passes that the processor judges again; the first shard also compiles."""
+SHARDS = {"cpu": 1, "gpu": 4}
+"""Training objects of which a shard each is made."""
+VALID = "strict"  # Protocol that grasps of a shard pass
 
 
 def median(run: Callable[[], object], repetitions: int) -> float:
@@ -137,16 +141,19 @@ def descents(device: str, repetitions: int) -> list[list[object]]:
 
 def shards(device: str, options: argparse.Namespace) -> list[list[object]]:
     """Rows of whole shards, which one process makes and confirms: candidates, and valid grasps a second."""
-    hand, obj, rows = load_hand(HAND), load_object(OBJECT), []
+    hand, names, rows = load_hand(HAND), resolve_objects(["builtin:train"]), []
+    models = [load_object(name) for name in names[::len(names) // SHARDS[kind(device)]][:SHARDS[kind(device)]]]
+    _ = [(obj.distance_field, obj.parts) for obj in models]
     for share in SHARES[kind(device)]:
-        config = EngineConfig(confirm=share, synthesis=SynthesisConfig(device=device)).suited()
+        config = EngineConfig(protocol=VALID, confirm=share, synthesis=SynthesisConfig(device=device)).suited()
         begin = time.perf_counter()
-        _, made = valid_grasps(hand, obj, 0, config)
+        made = [valid_grasps(hand, obj, 0, config)[1] for obj in models]
         seconds = time.perf_counter() - begin
-        note(options.record, f"shard, {share:g} confirmed", device=device, rate=made.valid / seconds, valid=made.valid,
-             candidates=made.candidates, judged=made.judged, seconds=seconds)
-        what = f"shard of {made.candidates} candidates, {made.judged} of {made.valid} confirmed"
-        rows.append(said([what, device, *BLANK, f"{1e3 * seconds / made.candidates:.3f}", made.valid / seconds]))
+        count, valid, judged = (sum(getattr(one, name) for one in made) for name in ("candidates", "valid", "judged"))
+        note(options.record, f"shard, {share:g} confirmed", device=device, rate=valid / seconds, valid=valid, candidates=count,
+             judged=judged, seconds=seconds, objects=[obj.name for obj in models], protocol=VALID)
+        what = f"{len(models)} shards, {count} candidates, {judged} of {valid} confirmed"
+        rows.append(said([what, device, *BLANK, f"{1e3 * seconds / count:.3f}", valid / seconds]))
     return rows
 
 

@@ -16,8 +16,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict import predictor
 from dro_grasp.predict.config import RetryConfig
 from dro_grasp.predict.sources import source as sources
@@ -28,6 +30,7 @@ from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
+from dro_grasp.training.data.engine.worker import EngineConfig
 from lab.benchmarks import agreement, data_card, device, device_trials, dexgraspbench, dexgraspbench_official, gpu_table
 from lab.benchmarks.report import ROOT, note
 from lab.studies import directions, matching_rank, paper_form
@@ -186,6 +189,30 @@ def test_candidates_a_second_are_of_those_that_were_made(first: int, tmp_path: P
     assert one["candidates"] == sum(made[len(made) // 2:]) == {2: 8, 16: 16}[first]
     assert one["rate"] == pytest.approx(1e3 * one["candidates"] / one["milliseconds"])
     assert float(rate) == pytest.approx(one["rate"], abs=0.06)
+
+
+def test_synthesis_is_of_strict_valid_grasps_of_built_in_training_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, clock = [], iter(range(0, 99, 10))
+
+    def shard(hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig) -> tuple[None, Yield]:
+        asked.append((hand.name, obj.name, obj.split, config.protocol, config.confirm))
+        return None, Yield(candidates=100, valid=10 + len(asked), judged=5)
+
+    monkeypatch.setattr(device, "valid_grasps", shard)
+    monkeypatch.setattr(device, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(device, "SHARDS", {"cpu": 3})
+    monkeypatch.setattr(device, "SHARES", {"cpu": (1.0, 0.1)})
+    device.shards("cpu", SimpleNamespace(record=tmp_path / "rows.jsonl"))
+    assert {(hand, split, rules) for hand, _, split, rules, _ in asked} == {("allegro", "train", "strict")}
+    names = [name for _, name, *_ in asked]
+    assert names[:3] == names[3:]
+    assert set(names) < set(resolve_objects(["builtin:train"]))
+    assert [share for *_, share in asked] == [1.0] * 3 + [0.1] * 3
+    found = _noted(tmp_path / "rows.jsonl")
+    assert [(found[name]["rate"], found[name]["valid"], found[name]["judged"]) for name in (
+        "shard, 1 confirmed", "shard, 0.1 confirmed")] == [(3.6, 36, 15), (4.5, 45, 15)]
 
 
 @pytest.mark.parametrize("path", device_trials.FILES, ids=lambda path: path.stem)
