@@ -192,6 +192,8 @@ def test_room_grows_for_contacts_at_once_and_for_constraints_where_many_worlds_l
 def test_graphs_are_of_few_sizes(hand: Hand, obj: ObjectModel) -> None:
     graphs = warp_worlds._Graphs(joint_model((cached_scene(hand, obj, CARRY),)), "cuda", ())
     assert [graphs.number(n) for n in (1000, 300, 1024, 256, 200, 3, 128, 2049)] == [1024, 1024, 1024, 256, 256, 128, 128, 4096]
+    graphs = warp_worlds._Graphs(joint_model((cached_scene(hand, obj, CARRY),)), "cpu", ())
+    assert [graphs.number(n) for n in (2, 1, 12)] == [2, 2, 16]  # the processor takes as long as there are worlds
 
 
 def test_a_device_without_the_extra_says_what_to_install(
