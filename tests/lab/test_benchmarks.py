@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import subprocess
@@ -21,7 +22,9 @@ from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict import predictor
-from dro_grasp.predict.config import RetryConfig
+from dro_grasp.predict.config import GraspRequest, RetryConfig
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources import source as sources
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Asked, Candidates, Source
@@ -31,7 +34,16 @@ from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
 from dro_grasp.training.data.engine.worker import EngineConfig
-from lab.benchmarks import agreement, data_card, device, device_trials, dexgraspbench, dexgraspbench_official, gpu_table
+from lab.benchmarks import (
+    agreement,
+    data_card,
+    device,
+    device_trials,
+    dexgraspbench,
+    dexgraspbench_official,
+    gpu_table,
+    returned,
+)
 from lab.benchmarks.report import ROOT, note
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
@@ -163,6 +175,24 @@ def test_what_a_filter_keeps_is_counted_with_its_diversity(tmp_path: Path) -> No
         joints = batch.joints.double().numpy().std(0, ddof=1)
         wanted = [np.concatenate([wrist, joints]).mean(), wrist.mean(), joints.mean()]
         assert [float(told[name]) for name in names] == pytest.approx(wanted, abs=6e-4)
+
+
+def test_a_returned_grasp_takes_its_candidates_with_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The requests are those of `predict` with its defaults; time, by a clock of its own, is for what was returned."""
+    asked, predict, clock = [], GraspPredictor.run, itertools.count(0.0, 0.5)
+
+    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
+        asked.append(request)
+        return predict(self, problem, request)
+
+    monkeypatch.setattr(GraspPredictor, "run", run)
+    monkeypatch.setattr(returned, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    returned.main("--num 2 --hands gripper3 --objects can --seeds 1 --json".split())
+    assert json.loads(capsys.readouterr().out)["seconds_a_grasp"] == {"2": 0.25}
+    GraspPredictor().predict(loaded_hand("gripper3"), load_object("can"), 2, 0)
+    assert asked[-2] == asked[-1]
 
 
 def _noted(path: Path) -> dict[str, dict[str, float]]:
