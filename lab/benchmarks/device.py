@@ -152,7 +152,7 @@ def shards(device: str, options: argparse.Namespace) -> list[list[object]]:
         count, valid, judged = (sum(getattr(one, name) for one in made) for name in ("candidates", "valid", "judged"))
         note(options.record, f"shard, {share:g} confirmed", device=device, rate=valid / seconds, valid=valid, candidates=count,
              judged=judged, seconds=seconds, objects=[obj.name for obj in models], protocol=VALID)
-        what = f"{len(models)} shards, {count} candidates, {judged} of {valid} confirmed"
+        what = f"shards: {len(models)}, {count} candidates, {judged} of {valid} confirmed"
         rows.append(said([what, device, *BLANK, f"{1e3 * seconds / count:.3f}", valid / seconds]))
     return rows
 

@@ -276,6 +276,7 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     def run(command: list[str], timeout: float, **_: object) -> SimpleNamespace:
         begun.append(command)
         assert command[-2:] == ["--record", str(record)]
+        assert command[command.index("--device") + 1] == "cuda"
         if len(begun) == 1:
             for name in gpu_table.parts("cuda")[0][0]:
                 note(record, name, device="cuda", rate=600.0, milliseconds=151.0, candidates=1024)
@@ -290,6 +291,7 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     monkeypatch.setattr(gpu_table, "subprocess", SimpleNamespace(run=run, **{
         name: getattr(subprocess, name) for name in ("DEVNULL", "TimeoutExpired")}))
     monkeypatch.setattr(gpu_table, "require_device", lambda name: None)
+    monkeypatch.setattr(gpu_table, "state", lambda: "this code")
     gpu_table.main(["--record", str(record)])
     names = [name for names, _ in gpu_table.parts("cuda") for name in names]
     assert sorted(names) == sorted(row.name for row in gpu_table.ROWS)
@@ -300,8 +302,6 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
         (600.0, "yes"), (600.0, "yes"), (151.0, "no"), (4999.0, "no"), ("blank", "")]
     assert all(row[1] == "blank" for row in table[5:])
     assert shown.count("blank") == len(table) - 4 + 1
-    with record.open("a") as file:
-        file.write("\n")
     for hand, grasps in (("allegro", 400), ("barrett", 100)):
         note(record, f"agreement, {hand}, strict", device="cuda", same=grasps - 1, grasps=grasps, asked=400)
     note(record, "training, multi", device="cpu", rate=1.0)
@@ -311,3 +311,30 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     assert not any("prediction" in command for command in begun)
     assert not any("data/grasps/allegro.parquet" in command for command in begun)
     assert any("data/grasps/barrett.parquet" in command for command in begun)
+    begun.clear()
+    monkeypatch.setattr(gpu_table, "state", lambda: "other code")
+    gpu_table.main(["--record", str(record), "--show"])
+    assert gpu_table.noted(record, "cuda")
+    gpu_table.main(["--record", str(record), "--minutes", "1"])
+    assert len(begun) == len(gpu_table.parts("cuda"))
+
+
+def test_rows_of_a_gpu_are_of_code_weights_and_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashes = {"src/dro_grasp": "1", "lab/benchmarks": "2"}
+    monkeypatch.setattr(gpu_table, "code_hash", hashes.__getitem__)
+    found = [gpu_table.state()]
+    for name, other in (("code_hash", lambda part: "1"), ("weights_hashes", lambda: {"a": "b"}),
+                        ("machine", lambda: {"cuda": "another"})):
+        monkeypatch.setattr(gpu_table, name, other)
+        found.append(gpu_table.state())
+    assert len(set(found)) == 4
+
+
+def test_a_table_is_rehearsed_with_warp_on_the_processor(tmp_path: Path) -> None:
+    for names, command in gpu_table.parts("warp"):
+        used = command[command.index("--device") + 1]
+        assert used == ("warp" if command[0] == "device_trials" else "cpu")
+        for name in names:
+            note(tmp_path / "rows.jsonl", name, device=used)
+    assert set(gpu_table.noted(tmp_path / "rows.jsonl", "warp")) == {
+        name for names, _ in gpu_table.parts("warp") for name in names}
