@@ -197,8 +197,9 @@ MEASUREMENTS = {
         needs=LABELS),
     "speed": Measurement("Times on the processor, nothing beside", {
         name: f"python -m lab.benchmarks.{name} {options}--json" for name, options in (
-            ("commands", "--runs 3 "), ("inference", ""), ("joint_solver", ""), ("kernel", ""), ("trials", "--protocol carry "),
-            ("synthesis", "--protocol carry "))}, wings=("compare", "training", "cli"), alone=True),
+            ("commands", "--runs 3 "), ("inference", ""), ("returned", ""), ("joint_solver", ""), ("kernel", ""),
+            ("trials", "--protocol carry "), ("synthesis", "--protocol carry "))},
+        wings=("compare", "training", "cli"), alone=True),
     "gpu": Measurement("Times on a GPU", {
         "table": "python -m lab.benchmarks.gpu_table --json"}, wings=("training",), alone=True, device="cuda"),
 }

@@ -10,6 +10,11 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
+
+# PyTorch's optimisers import Triton, which then is a compiler or an interpreter for good.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 if os.environ.get("CHECK_SHAPES"):  # as `make test-full` sets it
     import jaxtyping
@@ -47,8 +52,6 @@ def assets_folder() -> Path:
 @pytest.fixture(params=["fake", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """A device that is not the CPU: the strict fake one, and with the marker `gpu` a real one."""
-    import torch
-
     from tests.helpers.fake_device import fake_device
 
     if request.param == "fake":

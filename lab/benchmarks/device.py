@@ -3,7 +3,8 @@
 Hands and objects are built in. Prediction is of candidates of the network alone, sixteen for each grasp that is returned: many
 of one pair, some of many pairs of one hand, and the four of which one grasp is chosen, by stage, with settling and without. The
 first run, which captures graphs, is told apart. Many pairs are of sixteen objects, each of which comes four times as an object
-of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process. Training is measured by
+of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process: what is `strict`-valid
+and confirmed, of training objects that are prepared before. Training is measured by
 `lab.benchmarks.training`, and all of it in a few minutes by `lab.benchmarks.gpu_table`.
 
     python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--settled] [--alone] [--quick]
@@ -20,6 +21,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dro_grasp.devices import require_device
 from dro_grasp.hands.hand import Hand
@@ -27,7 +29,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig, RetryConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -42,11 +44,16 @@ PREDICTIONS = {"cpu": {ONE: (1, 2, 16), MANY: (4, 1, 4), SINGLE: (1, 1, 4)},
                "gpu": {ONE: (1, 64, 16), MANY: (64, 1, 16), SINGLE: (1, 1, 4)}}
 """Pairs, grasps of each, and candidates of each grasp."""
 STAGES = ("network", "choose", "decode", "refine", "rank", "settle", "weigh")
+ALL_AT_FIRST = RetryConfig(first=16)
+"""All candidates are asked for at once, where half are by default as long as these suffice."""
 SETTLED = (True, False)  # Whether candidates close in simulation
 DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 SHARES = {"cpu": (1.0,), "gpu": (1.0, 0.1)}
 """Shares of what passes that the processor judges again; the first shard also compiles."""
+SHARDS = {"cpu": 1, "gpu": 4}
+"""Training objects of which a shard each is made."""
+VALID = "strict"  # Protocol that grasps of a shard pass
 
 
 def median(run: Callable[[], object], repetitions: int) -> float:
@@ -74,38 +81,48 @@ def objects(count: int) -> list[ObjectModel]:
     return again
 
 
+class Run(NamedTuple):
+    """What one prediction took."""
+
+    seconds: float
+    stages: dict[str, float]  # seconds of each
+    made: int  # candidates, which may be fewer or more than were asked for
+
+
 def predictions(device: str, repetitions: int, options: argparse.Namespace) -> list[list[object]]:
-    """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates a second."""
+    """Rows of predictions: what, seconds of the first run, milliseconds of a candidate by stage, candidates made a second."""
     hand, rows = load_hand(HAND), []
     for settled in SETTLED[:1] if options.settled else SETTLED:
         finish = FinishConfig() if settled else FinishConfig(settle=None)
-        predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish))
+        predictor = GraspPredictor(device=device, config=PredictorConfig(finish=finish, retry=ALL_AT_FIRST))
         for name, (pairs, num, candidates) in PREDICTIONS[kind(device)].items():
-            models, count = objects(pairs), pairs * num * candidates
+            models = objects(pairs)
             request = GraspRequest(num, 0, candidates=candidates, source="network", least_confidence=0.0)
             # Closing in simulation takes most of the time, and is timed once.
-            times = 1 if settled and count > SLOW else repetitions
+            times = 1 if settled and pairs * num * candidates > SLOW else repetitions
             warm = 1 if times == 1 else WARM_RUNS
             runs = [one_run(predictor, hand, models, replace(request, seed=seed)) for seed in range(warm + times)]
             kept = runs[warm:]
-            whole = statistics.median(seconds for seconds, _ in kept)
-            parts = [1e3 * statistics.median(stages[name] for _, stages in kept) / count for name in STAGES]
+            whole, count = (statistics.median(values) for values in ([run.seconds for run in kept], [run.made for run in kept]))
+            parts = [1e3 * statistics.median(run.stages[name] for run in kept) / count for name in STAGES]
             what = f"{pairs} x {num} x {candidates}, {'settled' if settled else 'scored'}"
             note(options.record, f"{name}, {'settled' if settled else 'scored'}", device=device, rate=count / whole,
-                 milliseconds=1e3 * whole, first=runs[0][0], stages=dict(zip(STAGES, parts, strict=True)), candidates=count)
-            rows.append(said([what, device, f"{runs[0][0]:.2f}", *(f"{part:.3f}" for part in parts),
+                 milliseconds=1e3 * whole, first=runs[0].seconds, candidates=count,
+                 stages=dict(zip(STAGES, parts, strict=True)))
+            rows.append(said([what, device, f"{runs[0].seconds:.2f}", *(f"{part:.3f}" for part in parts),
                               f"{1e3 * whole / count:.3f}", f"{count / whole:.1f}"]))
     return rows
 
 
 def one_run(
     predictor: GraspPredictor, hand: Hand, models: list[ObjectModel], request: GraspRequest
-) -> tuple[float, dict[str, float]]:
-    """Seconds of one prediction of all objects, and of its stages."""
+) -> Run:
+    """One prediction of all objects."""
     begin = time.perf_counter()
     made = predictor.run_many(problems_of(hand, models, predictor.device, Constraints()), request)
     whole = time.perf_counter() - begin
-    return whole, {name: sum(one.seconds[name] for one in made if isinstance(one, Prediction)) for name in STAGES}
+    found = [one for one in made if isinstance(one, Prediction)]
+    return Run(whole, {name: sum(one.seconds[name] for one in found) for name in STAGES}, sum(one.candidates for one in found))
 
 
 SLOW = 100  # Candidates from which on closing in simulation is timed once
@@ -124,16 +141,19 @@ def descents(device: str, repetitions: int) -> list[list[object]]:
 
 def shards(device: str, options: argparse.Namespace) -> list[list[object]]:
     """Rows of whole shards, which one process makes and confirms: candidates, and valid grasps a second."""
-    hand, obj, rows = load_hand(HAND), load_object(OBJECT), []
+    hand, names, rows = load_hand(HAND), resolve_objects(["builtin:train"]), []
+    models = [load_object(name) for name in names[::len(names) // SHARDS[kind(device)]][:SHARDS[kind(device)]]]
+    _ = [(obj.distance_field, obj.parts) for obj in models]
     for share in SHARES[kind(device)]:
-        config = EngineConfig(confirm=share, synthesis=SynthesisConfig(device=device)).suited()
+        config = EngineConfig(protocol=VALID, confirm=share, synthesis=SynthesisConfig(device=device)).suited()
         begin = time.perf_counter()
-        _, made = valid_grasps(hand, obj, 0, config)
+        made = [valid_grasps(hand, obj, 0, config)[1] for obj in models]
         seconds = time.perf_counter() - begin
-        note(options.record, f"shard, {share:g} confirmed", device=device, rate=made.valid / seconds, valid=made.valid,
-             candidates=made.candidates, judged=made.judged, seconds=seconds)
-        what = f"shard of {made.candidates} candidates, {made.judged} of {made.valid} confirmed"
-        rows.append(said([what, device, *BLANK, f"{1e3 * seconds / made.candidates:.3f}", made.valid / seconds]))
+        count, valid, judged = (sum(getattr(one, name) for one in made) for name in ("candidates", "valid", "judged"))
+        note(options.record, f"shard, {share:g} confirmed", device=device, rate=valid / seconds, valid=valid, candidates=count,
+             judged=judged, seconds=seconds, objects=[obj.name for obj in models], protocol=VALID)
+        what = f"shards: {len(models)}, {count} candidates, {judged} of {valid} confirmed"
+        rows.append(said([what, device, *BLANK, f"{1e3 * seconds / count:.3f}", valid / seconds]))
     return rows
 
 

@@ -1,21 +1,25 @@
 """Trials on a device beside the processor's: how many verdicts agree, how many run in a second, and what settling takes.
 
-Agreement is of stored grasps, which hold under `strict`: the same number of each hand, in equal shares of its first training
-objects. Speed is of the network's refined candidates of one hand and object, repeated, without the processor's confirmation.
-Settling is that of the same candidates, by part.
+Agreement is of stored grasps, which hold under `strict`: the same number of each hand, all those of its first training objects
+until the number is full. Speed is of the network's refined candidates of one hand and object, repeated, without the processor's
+confirmation. Settling is that of the same candidates, by part.
 
     python -m lab.benchmarks.device_trials [--device cuda] [--grasps FILE ...] [--num N] [--protocols NAME ...]
-        [--worlds N ...] [--settled N] [--hand HAND] [--object NAME] [--record FILE] [--json]
+        [--worlds N ...] [--settled N] [--hand HAND] [--object NAME] [--pack FOLDER] [--record FILE] [--json]
 
-`--device warp` is MuJoCo Warp on the processor: about one closing a second.
+Stored grasps are of development assets. `--pack` measures nothing: it copies what these grasps need, a megabyte, into a
+folder that is DRO_GRASP_ASSETS on another machine. `--device warp` is MuJoCo Warp on the processor: about one closing a second.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -42,20 +46,31 @@ from lab.benchmarks.agreement import kappa
 from lab.benchmarks.report import emit, note, rate
 
 FILES = tuple(Path("data/grasps") / f"{name}.parquet" for name in ("allegro", "barrett", "shadowhand"))
-OBJECTS = 4
-"""Objects of each hand."""
 DIFFERENT = 64
 """Grasps that are repeated until they fill the worlds."""
 COLUMNS = ("what", "grasps", "held on the processor [%]", "held on the device [%]", "same", "same [%]", "kappa", "a second")
 
 
 def shares(grasps: GraspBatch, num: int) -> Iterator[tuple[str, Int[Tensor, " k"]]]:
-    """Names of the first training objects, and as many grasps of each as makes the number."""
-    train = [row for row, split in enumerate(grasps.split) if split == "train"]
-    names = list(dict.fromkeys(grasps.object[row] for row in train))[:OBJECTS]
-    for i, name in enumerate(names):
-        count = num * (i + 1) // len(names) - num * i // len(names)
-        yield name, torch.tensor([row for row in train if grasps.object[row] == name][:count])
+    """Names of the first training objects, and rows of their grasps, until these are as many as the number."""
+    rows: dict[str, list[int]] = {}
+    for row in [row for row, split in enumerate(grasps.split) if split == "train"]:
+        rows.setdefault(grasps.object[row], []).append(row)
+    for name, own in rows.items():
+        if num > 0:
+            yield name, torch.tensor(own[:num])
+        num -= len(own)
+
+
+def pack(paths: Sequence[Path], num: int, folder: Path) -> None:
+    """Copy the meshes and convex parts of the objects that agreement is measured on, with a list of them alone."""
+    source = Path(os.environ["DRO_GRASP_ASSETS"]) / "objects"
+    names = {name for path in paths for name, _ in shares(GraspBatch.load(path), num)}
+    entries = [entry for entry in json.loads((source / "manifest.json").read_text()) if entry["name"] in names]
+    for file in (entry["file"] for own in entries for entry in (own, own["collision"]) if entry):
+        (target := folder / "objects" / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source / file, target)
+    (folder / "objects" / "manifest.json").write_text(json.dumps(entries))
 
 
 def agreement(path: Path, protocol: str, options: argparse.Namespace) -> list[list[object]]:
@@ -189,9 +204,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--settled", type=int, default=1024, help="grasps to settle; 0: none")
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="rubber_duck")
+    parser.add_argument("--pack", type=Path, help="copy the assets that the stored grasps need there, and measure nothing")
     parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
+    if options.pack:
+        return pack(options.grasps, options.num, options.pack)
     lines = [line for path in options.grasps for name in options.protocols for line in agreement(path, name, options)]
     device = "cpu" if options.device == "warp" else options.device
     if options.worlds or options.settled:

@@ -1,12 +1,14 @@
 """Everything that is told of a GPU, by one command in at most eight minutes.
 
 What is measured is appended to a file at once, so a run that is cut off keeps its rows, and the next one measures what is
-missing. The parts follow each other, each in a process of its own, the agreement of verdicts last. A row that nobody measured
-is blank.
+missing. Rows of other code, other weights or another card are measured anew. The parts follow each other, each in a process of
+its own, the agreement of verdicts last. A row that nobody measured is blank.
 
     python -m lab.benchmarks.gpu_table [--device cuda] [--minutes 8] [--record out/gpu.jsonl] [--show] [--json]
 
-`--device cpu` rehearses it in small, without a GPU; `--show` measures nothing.
+Agreement of verdicts needs development assets; `lab.benchmarks.device_trials --pack FOLDER` copies the few of them.
+Two devices rehearse it in small, without a GPU: `cpu`, and `warp`, with trials by MuJoCo Warp on the processor and all else as
+with `cpu`. Its kernels compile for some minutes the first time. `--show` measures nothing.
 """
 
 from __future__ import annotations
@@ -16,15 +18,17 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.devices import require_device
+from dro_grasp.simulation.worlds import WARP
 from lab.benchmarks.device import MANY, ONE, SHARES, SINGLE
 from lab.benchmarks.device_trials import FILES
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, machine, note
+from lab.runner import PACKAGE, code_hash, weights_hashes
 
 Found = dict[str, Any]  # What a part noted under a name
 
@@ -41,6 +45,9 @@ class Row:
     fewer: bool = False  # whether less is better
 
 
+SMALL = {"cpu": "cpu", WARP: "cpu"}
+"""Devices that rehearse, and where PyTorch computes with them."""
+BEGUN = "begun"  # Name of what tells of which state the rows after it are
 HANDS = tuple(path.stem for path in FILES)
 ROWS = (
     Row("one pair, 1,024 candidates, settled, the best 64 weighed", f"{ONE}, settled", "candidates/s", 500),
@@ -48,8 +55,8 @@ ROWS = (
     Row("one grasp, four candidates, settled and weighed", f"{SINGLE}, settled", "ms", 150, lambda f: f["milliseconds"], True),
     Row("closings, allegro and duck", "closings", "1/s", 5000),
     Row("whole strict trials, the same", "whole strict trials", "1/s", 800),
-    *(Row(f"synthesis, one process, {share:.0%} of what passes confirmed", f"shard, {share:g} confirmed", "grasps/s", 500)
-      for share in SHARES["gpu"]),
+    *(Row(f"synthesis, strict-valid, allegro on training objects, {share:.0%} of it confirmed", f"shard, {share:g} confirmed",
+          "grasps/s", 500) for share in SHARES["gpu"]),
     Row("training, multi", "training, multi", "samples/s", 10_000),
     Row("training, paper size", "training, paper", "samples/s", 1_500),
     *(Row(f"verdicts of the processor, strict, {hand}", f"agreement, {hand}, strict", "%", 97,
@@ -59,29 +66,50 @@ ROWS = (
 
 def parts(device: str) -> list[tuple[list[str], list[str]]]:
     """Names that each part notes, and its command; what matters most comes first."""
-    small = device == "cpu"
+    small = device in SMALL
+    trials, own = ["device_trials", "--device", device], ["--device", SMALL.get(device, device)]
     predictions = [f"{name}, settled" for name in (ONE, MANY, SINGLE)]
     shards = [f"shard, {share:g} confirmed" for share in SHARES["cpu" if small else "gpu"]]
-    alike = ["device_trials", "--worlds", "--settled", "0", "--protocols", "strict", "--num", "8" if small else "400"]
+    alike = [*trials, "--worlds", "--settled", "0", "--protocols", "strict", "--num", "2" if small else "400"]
     return [
-        (predictions, ["device", "--only", "prediction", "--settled", "--alone", "--quick"]),
+        (predictions, ["device", *own, "--only", "prediction", "--settled", "--alone", "--quick"]),
         (["closings", "whole strict trials"],
-         ["device_trials", "--grasps", "--settled", "0", "--worlds", "64" if small else "4096"]),
-        (["training, multi", "training, paper"], ["training", "--quick"]),
-        (shards, ["device", "--only", "shards", "--alone"]),
+         [*trials, "--grasps", "--settled", "0", "--worlds", "2" if small else "4096"]),
+        (["training, multi", "training, paper"], ["training", *own, "--quick"]),
+        (shards, ["device", *own, "--only", "shards", "--alone"]),
         *(([f"agreement, {path.stem}, strict"], [*alike, "--grasps", str(path)]) for path in FILES),
     ]
 
 
-def noted(record: Path, device: str) -> dict[str, Found]:
-    """What was found on a device, the last of each name; a line that was cut off counts as nothing."""
-    found: dict[str, Found] = {}
+def state() -> str:
+    """What rows are of: code, weights and card."""
+    weights = "".join(weights_hashes().values())
+    return f"{code_hash(PACKAGE)} {code_hash('lab/benchmarks')} {weights} {machine()['cuda']}"
+
+
+def kept(record: Path) -> Iterator[Found]:
+    """Lines of a file; one that was cut off counts as nothing."""
     for line in record.read_text().splitlines() if record.is_file() else ():
         try:
-            one = json.loads(line)
+            yield json.loads(line)
         except json.JSONDecodeError:
             continue
-        if one.get("device") == device:
+
+
+def begin(record: Path) -> None:
+    """Say of which state the next rows are, where it is another than that of the last ones."""
+    before = [one["state"] for one in kept(record) if one["name"] == BEGUN]
+    if before[-1:] != [now := state()]:
+        note(record, BEGUN, state=now)
+
+
+def noted(record: Path, device: str) -> dict[str, Found]:
+    """What was found on a device in the last state, the last of each name."""
+    found: dict[str, Found] = {}
+    for one in kept(record):
+        if one["name"] == BEGUN:
+            found = {}
+        elif one["device"] in (device, SMALL.get(device)):
             found[one["name"]] = one
     return found
 
@@ -94,6 +122,7 @@ def whole(found: Found | None) -> bool:
 def measure(options: argparse.Namespace) -> None:
     """Run what is missing, one part after the other, until the time is over."""
     end = time.monotonic() + 60 * options.minutes
+    begin(options.record)
     for names, command in parts(options.device):
         if all(whole(noted(options.record, options.device).get(name)) for name in names):
             continue
@@ -101,8 +130,7 @@ def measure(options: argparse.Namespace) -> None:
         if left <= 0:
             print(f"no time left for {', '.join(names)}", file=sys.stderr)
             continue
-        own = [sys.executable, "-m", f"lab.benchmarks.{command[0]}", *command[1:], "--device", options.device, "--record",
-               str(options.record)]
+        own = [sys.executable, "-m", f"lab.benchmarks.{command[0]}", *command[1:], "--record", str(options.record)]
         try:
             code = subprocess.run(own, timeout=left, stdout=subprocess.DEVNULL).returncode
         except subprocess.TimeoutExpired:
@@ -136,7 +164,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     if not options.show:
-        require_device(options.device)
+        require_device("cpu" if options.device in SMALL else options.device)
         measure(options)
     found = noted(options.record, options.device)
     emit(f"On {options.device}; blank: not measured", lines(found), ["what", "measured", "unit", "goal", "reached", "of"],

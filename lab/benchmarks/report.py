@@ -72,8 +72,9 @@ def note(path: Path | None, name: str, **values: object) -> None:
     """Append a result to a file of JSON lines, if one is given: whatever ends the run later, it is kept."""
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        cut_off = path.is_file() and not path.read_bytes().endswith(b"\n")
         with path.open("a") as file:
-            file.write(json.dumps({"name": name, **values, "machine": machine()}) + "\n")
+            file.write("\n" * cut_off + json.dumps({"name": name, **values, "machine": machine()}) + "\n")
 
 
 def rate(held: Collection[bool] | np.ndarray | Tensor, asked: int | None = None) -> str:

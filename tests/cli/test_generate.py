@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from rich.console import Console
 
-from dro_grasp.cli import output
-from dro_grasp.cli.main import main
+from dro_grasp.cli import generate as generating, output
+from dro_grasp.cli.main import main, parse
 from dro_grasp.compare.metrics import wilson_interval
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import NoGraspError, ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands import library
 from dro_grasp.objects import catalogue
@@ -30,6 +31,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.stages import refine
 from dro_grasp.simulation.trial import simulate
+from tests.helpers.fake_device import DEVICE, fake_device
 from tests.helpers.loaded_hands import loaded_hand
 
 KEYS = {
@@ -157,8 +159,6 @@ def test_bare_cloud_is_not_tried(generate, tmp_path: Path) -> None:
 
 
 def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
-    import trimesh
-
     objects, results = tmp_path / "objects", tmp_path / "results"
     objects.mkdir(), results.mkdir()
     trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
@@ -171,8 +171,6 @@ def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
 def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
     weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import trimesh
-
     objects, results = tmp_path / "objects", tmp_path / "results"
     objects.mkdir(), results.mkdir()
     trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
@@ -188,6 +186,39 @@ def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
     assert "too large" in failed["error"]
     assert "huge.stl" in said.err
     assert sorted(f.name for f in results.iterdir()) == ["a.parquet", "z.parquet"]
+
+
+def test_a_device_predicts_the_objects_of_a_folder_together(
+    weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As many at once as suits it, the last part smaller; a file that is no object costs only its own grasps."""
+    folder, together, run_many = tmp_path / "objects", [], GraspPredictor.run_many
+    folder.mkdir()
+    for i, side in enumerate((0.04, 0.05, 0.06, 0.045)):
+        trimesh.creation.box((side, side, 0.08)).export(folder / f"box{i}.ply")
+    (folder / "box2.ply").write_text("no mesh")
+
+    def watched(self: GraspPredictor, problems: list[GraspProblem], *given: Any) -> list[Prediction | NoGraspError]:
+        together.append([problem.obj.name for problem in problems])
+        return run_many(self, problems, *given)
+
+    monkeypatch.setattr(GraspPredictor, "run_many", watched)
+    command = ["generate", "--hand", "gripper3", "--object", str(folder), "--weights", weights, "--num", "2",
+               "--candidates", "1", "--source", "network", "--no-refine", "--protocol", "none", "--json", "--device"]
+    assert [len(part) for part in parse([*command, DEVICE])._parts(list(range(130)))] == [64, 64, 2]
+    monkeypatch.setattr(generating, "TOGETHER", 3)
+    found = []
+    for device in ("cpu", DEVICE):
+        (output := tmp_path / device).mkdir()
+        with fake_device():
+            assert main([*command, device, "--output", str(output)]) == 2
+        assert "box2" in capsys.readouterr().err
+        found.append([GraspBatch.load(output / f"box{i}.parquet") for i in (0, 1, 3)])
+    assert together == [["box0"], ["box1"], ["box3"], ["box0", "box1"], ["box3"]]
+    for one, other in zip(*found, strict=True):
+        assert (one.object, len(one)) == (other.object, 2)
+        torch.testing.assert_close(other.joints, one.joints, atol=1e-3, rtol=0.0)
+        torch.testing.assert_close(other.T_object_wrist, one.T_object_wrist, atol=1e-3, rtol=0.0)
 
 
 def test_a_bad_camera_file_is_refused_once_for_all_objects(weights: str, tmp_path: Path, capsys) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 import subprocess
@@ -16,16 +17,34 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.network.presets import PRESETS
-from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict import predictor
+from dro_grasp.predict.config import GraspRequest, RetryConfig
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources import source as sources
 from dro_grasp.predict.sources.controls import palm_facing_starts
+from dro_grasp.predict.sources.source import Asked, Candidates, Source
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
-from lab.benchmarks import agreement, data_card, dexgraspbench, dexgraspbench_official, gpu_table
-from lab.benchmarks.report import note
+from dro_grasp.training.data.engine.worker import EngineConfig
+from lab.benchmarks import (
+    agreement,
+    data_card,
+    device,
+    device_trials,
+    dexgraspbench,
+    dexgraspbench_official,
+    gpu_table,
+    returned,
+)
+from lab.benchmarks.report import ROOT, note
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -158,6 +177,96 @@ def test_what_a_filter_keeps_is_counted_with_its_diversity(tmp_path: Path) -> No
         assert [float(told[name]) for name in names] == pytest.approx(wanted, abs=6e-4)
 
 
+def test_a_returned_grasp_takes_its_candidates_with_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The requests are those of `predict` with its defaults; time, by a clock of its own, is for what was returned."""
+    asked, predict, clock = [], GraspPredictor.run, itertools.count(0.0, 0.5)
+
+    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
+        asked.append(request)
+        return predict(self, problem, request)
+
+    monkeypatch.setattr(GraspPredictor, "run", run)
+    monkeypatch.setattr(returned, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    returned.main("--num 2 --hands gripper3 --objects can --seeds 1 --json".split())
+    assert json.loads(capsys.readouterr().out)["seconds_a_grasp"] == {"2": 0.25}
+    GraspPredictor().predict(loaded_hand("gripper3"), load_object("can"), 2, 0)
+    assert asked[-2] == asked[-1]
+
+
+def _noted(path: Path) -> dict[str, dict[str, float]]:
+    """What a benchmark appended to a file, by name."""
+    return {one["name"]: one for one in map(json.loads, path.read_text().splitlines())}
+
+
+@pytest.mark.parametrize("first", [2, 16])
+def test_candidates_a_second_are_of_those_that_were_made(first: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sixteen that may be made, half settle where all are not asked for at first: counts are the sources' own."""
+    made, propose = [], sources.ask_all
+
+    def counted(source: Source, asked: list[Asked], *given: object) -> list[Candidates]:
+        made.append(sum(one.num for one in asked))
+        return propose(source, asked, *given)
+
+    monkeypatch.setattr(predictor, "ask_all", counted)
+    monkeypatch.setattr(device, "PREDICTIONS", {"cpu": {device.ONE: (1, 4, 4)}})
+    for name, value in (("HAND", "gripper3"), ("OBJECT", "sphere"), ("ALL_AT_FIRST", RetryConfig(first=first))):
+        monkeypatch.setattr(device, name, value)
+    options = SimpleNamespace(settled=True, record=tmp_path / "rows.jsonl")
+    ((_, _, _, *_, rate),) = device.predictions("cpu", 1, options)
+    one, = _noted(options.record).values()
+    assert one["candidates"] == sum(made[len(made) // 2:]) == {2: 8, 16: 16}[first]
+    assert one["rate"] == pytest.approx(1e3 * one["candidates"] / one["milliseconds"])
+    assert float(rate) == pytest.approx(one["rate"], abs=0.06)
+
+
+def test_synthesis_is_of_strict_valid_grasps_of_built_in_training_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, clock = [], iter(range(0, 99, 10))
+
+    def shard(hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig) -> tuple[None, Yield]:
+        asked.append((hand.name, obj.name, obj.split, config.protocol, config.confirm))
+        return None, Yield(candidates=100, valid=10 + len(asked), judged=5)
+
+    monkeypatch.setattr(device, "valid_grasps", shard)
+    monkeypatch.setattr(device, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(device, "SHARDS", {"cpu": 3})
+    monkeypatch.setattr(device, "SHARES", {"cpu": (1.0, 0.1)})
+    device.shards("cpu", SimpleNamespace(record=tmp_path / "rows.jsonl"))
+    assert {(hand, split, rules) for hand, _, split, rules, _ in asked} == {("allegro", "train", "strict")}
+    names = [name for _, name, *_ in asked]
+    assert names[:3] == names[3:]
+    assert set(names) < set(resolve_objects(["builtin:train"]))
+    assert [share for *_, share in asked] == [1.0] * 3 + [0.1] * 3
+    found = _noted(tmp_path / "rows.jsonl")
+    assert [(found[name]["rate"], found[name]["valid"], found[name]["judged"]) for name in (
+        "shard, 1 confirmed", "shard, 0.1 confirmed")] == [(3.6, 36, 15), (4.5, 45, 15)]
+
+
+@pytest.mark.parametrize("path", device_trials.FILES, ids=lambda path: path.stem)
+def test_stored_grasps_of_each_hand_are_as_many_as_the_table_wants(path: Path) -> None:
+    grasps = GraspBatch.load(ROOT / path)
+    found = list(device_trials.shares(grasps, 400))
+    rows = torch.cat([rows for _, rows in found])
+    assert len(rows) == len(rows.unique()) == 400
+    assert {grasps.split[row] for row in rows.tolist()} == {"train"}
+    assert [grasps.object[row] for row in rows.tolist()] == [name for name, own in found for _ in own]
+
+
+@pytest.mark.assets
+def test_what_agreement_needs_of_the_assets_goes_to_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    names = [name for name, _ in device_trials.shares(GraspBatch.load(device_trials.FILES[0]), 100)]
+    expected = [load_object(name) for name in names]
+    device_trials.main(["--grasps", str(device_trials.FILES[0]), "--num", "100", "--pack", str(tmp_path)])
+    monkeypatch.setenv("DRO_GRASP_ASSETS", str(tmp_path))
+    assert resolve_objects(["assets:train"]) == sorted(names)
+    for one, own in zip(expected, map(load_object, names), strict=True):
+        assert (one.sha256, one.split, len(one.parts)) == (own.sha256, own.split, len(own.parts))
+
+
 def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_noted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,6 +276,7 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     def run(command: list[str], timeout: float, **_: object) -> SimpleNamespace:
         begun.append(command)
         assert command[-2:] == ["--record", str(record)]
+        assert command[command.index("--device") + 1] == "cuda"
         if len(begun) == 1:
             for name in gpu_table.parts("cuda")[0][0]:
                 note(record, name, device="cuda", rate=600.0, milliseconds=151.0, candidates=1024)
@@ -181,6 +291,7 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     monkeypatch.setattr(gpu_table, "subprocess", SimpleNamespace(run=run, **{
         name: getattr(subprocess, name) for name in ("DEVNULL", "TimeoutExpired")}))
     monkeypatch.setattr(gpu_table, "require_device", lambda name: None)
+    monkeypatch.setattr(gpu_table, "state", lambda: "this code")
     gpu_table.main(["--record", str(record)])
     names = [name for names, _ in gpu_table.parts("cuda") for name in names]
     assert sorted(names) == sorted(row.name for row in gpu_table.ROWS)
@@ -191,8 +302,6 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
         (600.0, "yes"), (600.0, "yes"), (151.0, "no"), (4999.0, "no"), ("blank", "")]
     assert all(row[1] == "blank" for row in table[5:])
     assert shown.count("blank") == len(table) - 4 + 1
-    with record.open("a") as file:
-        file.write("\n")
     for hand, grasps in (("allegro", 400), ("barrett", 100)):
         note(record, f"agreement, {hand}, strict", device="cuda", same=grasps - 1, grasps=grasps, asked=400)
     note(record, "training, multi", device="cpu", rate=1.0)
@@ -202,3 +311,30 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     assert not any("prediction" in command for command in begun)
     assert not any("data/grasps/allegro.parquet" in command for command in begun)
     assert any("data/grasps/barrett.parquet" in command for command in begun)
+    begun.clear()
+    monkeypatch.setattr(gpu_table, "state", lambda: "other code")
+    gpu_table.main(["--record", str(record), "--show"])
+    assert gpu_table.noted(record, "cuda")
+    gpu_table.main(["--record", str(record), "--minutes", "1"])
+    assert len(begun) == len(gpu_table.parts("cuda"))
+
+
+def test_rows_of_a_gpu_are_of_code_weights_and_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashes = {"src/dro_grasp": "1", "lab/benchmarks": "2"}
+    monkeypatch.setattr(gpu_table, "code_hash", hashes.__getitem__)
+    found = [gpu_table.state()]
+    for name, other in (("code_hash", lambda part: "1"), ("weights_hashes", lambda: {"a": "b"}),
+                        ("machine", lambda: {"cuda": "another"})):
+        monkeypatch.setattr(gpu_table, name, other)
+        found.append(gpu_table.state())
+    assert len(set(found)) == 4
+
+
+def test_a_table_is_rehearsed_with_warp_on_the_processor(tmp_path: Path) -> None:
+    for names, command in gpu_table.parts("warp"):
+        used = command[command.index("--device") + 1]
+        assert used == ("warp" if command[0] == "device_trials" else "cpu")
+        for name in names:
+            note(tmp_path / "rows.jsonl", name, device=used)
+    assert set(gpu_table.noted(tmp_path / "rows.jsonl", "warp")) == {
+        name for names, _ in gpu_table.parts("warp") for name in names}

@@ -29,6 +29,18 @@ def test_what_nobody_measured_says_so(tmp_path: Path) -> None:
             assert target.line(Results(tmp_path))[3:] == ["", "", "not measured"], target.what
 
 
+@pytest.mark.parametrize(("what", "told", "end"), [
+    ("one of sixteen grasps with its candidates", "81", "**not reached**"), ("one grasp alone", "249", "reached")])
+def test_a_grasp_s_time_is_of_predict_with_its_defaults(what: str, told: str, end: str, tmp_path: Path) -> None:
+    """Not of candidates that nothing is chosen from."""
+    cells = {name: {**CELL, "command": MEASUREMENTS["speed"].cells[name], "result": result} for name, result in {
+        "returned": {"seconds_a_grasp": {"1": 0.249, "16": 0.081}},
+        "inference": {"latency_default": 0.5, "batch16_per_grasp_default": 0.5}}.items()}
+    (tmp_path / "speed.json").write_text(json.dumps({"cells": cells}))
+    (line,) = (t.line(Results(tmp_path)) for t in targets.targets() if t.what == what)
+    assert line[3:] == [told, "0123456789", end]
+
+
 def test_a_rate_is_of_the_attempts_in_the_file(tmp_path: Path) -> None:
     cells = {name: {**CELL, "command": command, "result": {"attempts": [
         {"success": k < 3, "stage": "done"} for k in range(4)]}} for name, command in MEASUREMENTS["lifts"].cells.items()}

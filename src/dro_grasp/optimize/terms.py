@@ -68,8 +68,8 @@ def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Floa
 def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:
     """Penetration of each hand point into the object, given its signed distance [m]; zero outside."""
     # Differs from DexGraspNet, which sums over object points inside the hand; this sums over hand points inside the object.
-    inside = (distance < 0).to(distance.dtype)
-    return PointTerm(-distance * inside, -gradient * inside[..., None])
+    outward = (distance < 0) * -1.0
+    return PointTerm(distance * outward, gradient * outward[..., None])
 
 
 class SpherePairs(NamedTuple):
@@ -108,9 +108,8 @@ def joint_margin(
     The limits are the hand's own, narrowed to leave room for the squeeze. The optimiser keeps the hand's own limits by
     projection; this term does not.
     """
-    above, below = q - upper, lower - q
-    value = above.clamp_min(0) + below.clamp_min(0)
-    return value, (above > 0).to(q.dtype) - (below > 0).to(q.dtype)
+    beyond = q - q.clamp(lower, upper)
+    return beyond.abs(), beyond.sign()
 
 
 def link_wrenches(

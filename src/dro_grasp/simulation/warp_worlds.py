@@ -23,7 +23,7 @@ from dro_grasp.simulation.joint_model import JointModel, joint_model
 from dro_grasp.simulation.worlds import INPUTS, STATE, WARP, Ahead, ProcessorWorlds, Share, Values
 
 MOST = 4096  # Worlds that step together. Ours: with 16,384, an H100 has no memory for 128 contacts each
-FEWEST = 128  # Worlds of the smallest graph; others have powers of two. Ours: fewer are no faster
+FEWEST = 128  # Worlds of a GPU's smallest graph; others have powers of two. Ours: fewer are no faster
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
 SPARE = 0.01  # Share of worlds that may have more constraints than fit; they run on the processor (ours)
 LARGEST_ROOM = 1024  # Most contacts, and most constraints, that a world gets memory for (ours)
@@ -161,7 +161,7 @@ class _Graphs:
     def number(self, worlds: int) -> int:
         """Worlds of the graph for so many: the last one, unless it is too small, or four times as large as it must be."""
         if not self._number / 4 < worlds <= self._number:
-            self._number = max(FEWEST, 1 << (worlds - 1).bit_length())
+            self._number = max(1 if self._device == "cpu" else FEWEST, 1 << (worlds - 1).bit_length())
         return self._number
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import cached_tensor, on_accelerator
-from dro_grasp.geometry.se3 import apply, rotate
+from dro_grasp.geometry.se3 import rotate
 
 FIXED = 0  # Kind of a link that does not move against its parent (ours)
 REVOLUTE = 1  # Kind of a link that turns about its joint's axis (ours)
@@ -225,6 +225,10 @@ class KinematicTree:
             now = [now[place] for place in now]
         return tuple(rounds)
 
+    @cached_tensor
+    def _axes_and_anchors(self) -> Float[Tensor, "n_links 3 2"]:
+        return torch.stack([self.axis, self.anchor], -1)
+
     def motion_axes(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"]
     ) -> tuple[Float[Tensor, "*batch n_links 3"], Float[Tensor, "*batch n_links 3"]]:
@@ -232,8 +236,8 @@ class KinematicTree:
 
         A point p on link j or below it moves by linear[j] + angular[j] x p per unit of joint j.
         """
-        axis = rotate(T_world_link[..., :3, :3], self.axis)
-        anchor = apply(T_world_link, self.anchor)
+        axis, anchor = (T_world_link[..., :3, :3] @ self._axes_and_anchors).unbind(-1)
+        anchor = anchor + T_world_link[..., :3, 3]
         revolute = self._revolute[:, None]
         angular = torch.where(revolute, axis, torch.zeros_like(axis))
         linear = torch.where(revolute, _cross(anchor, axis), axis)
@@ -263,6 +267,8 @@ def _skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def _cross(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Cross product; several times as fast as torch.linalg.cross on small tensors."""
+    """Cross product; several times as fast as torch.linalg.cross on small tensors of a CPU."""
+    if on_accelerator(a.device):
+        return torch.linalg.cross(a, b, dim=-1)
     (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
