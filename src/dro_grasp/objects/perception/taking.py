@@ -25,12 +25,12 @@ HOLLOW = 0.35  # What ends higher than this share of its height above it is not 
 def taken_object(name: str, sight: Sight, segments: Segments, chosen: Chosen) -> ObjectModel:
     """The object of the chosen points in the scene's frame, with the plane below it as its table."""
     points = sight.points[chosen.own]
-    table = None if chosen.below is None else moved_plane(segments.planes[chosen.below], sight.T)
+    below = None if chosen.below is None else segments.planes[chosen.below]
+    table = None if below is None else moved_plane(below, sight.T)
     if not sight.from_camera:
         obj = cloud_object(name, points, origin=name, keep_table=True)
         return replace(obj, table=table, notes=(*obj.notes, *chosen.notes))
-    up = sight.T[2, :3] if chosen.below is None else segments.planes[chosen.below][:3]
-    whole = scanned_object(name, points, sight.T, keep_table=True, up=up)
+    whole = scanned_object(name, points, sight.T, keep_table=True, table=below)
     cloud, kept = whole.cloud.astype(np.float64), np.ones(len(whole.cloud), bool)
     if table is not None:
         kept &= cloud @ table[:3] > table[3]
