@@ -224,8 +224,8 @@ def complete_cloud(
 
     Points of the visible side [m] have outward unit normals; if all lie on one viewing ray, they are returned unchanged.
     Without the position of the `camera` [m], they are all on one side of a plane, whose normal is the mean of theirs.
-    Symmetries that preserve the `up` direction, if it is known, are preferred, and nothing is thought below the plane of the
-    `table`, its upward normal and its height along it [m]; the shipped network chooses between them by default.
+    Symmetries that preserve the `up` direction, if it is known, are preferred. What stands on the plane of a `table`, its upward
+    normal and its height along it [m], reaches down to it. The shipped network chooses between symmetries by default.
     """
     side, axes, middle = to_view_axes(points, normals, camera, table)
     if side.width < THINNEST:
@@ -243,7 +243,15 @@ def complete_cloud(
     share = min(1.0, len(seen) / max(1, int(near.sum())))
     added = np.flatnonzero(~near)[: round(share * int((~near).sum()))]
     both, both_normals = np.concatenate([seen, surface[added]]), np.concatenate([seen_normals, outward[added]])
-    return CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
+    whole = CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
+    return whole if table is None else stood(whole, table)
+
+
+def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"]) -> CompletedCloud:
+    """The cloud with its unseen side down to the table, and not below it."""
+    kept = ~whole.added | (whole.points @ table[:3] > table[3])
+    points, normals, added = (column[kept] for column in whole)
+    return CompletedCloud(*set_down(points, normals, added, table), added)
 
 
 def to_view_axes(
