@@ -289,6 +289,7 @@ def test_a_table_that_is_known_is_where_the_object_stands(depth: np.ndarray, T_o
     assert scan.table is not None
     np.testing.assert_allclose(scan.table, [0, 0, 1, low], atol=1e-9)
     assert scan.seen is not None
+    assert low - 1e-6 < scan.cloud[:, 2].min() < low + 0.003, "its unseen side reaches down to the table"
     for wrong in ([0.0, 0.0, 1.0], [0.0, 0.0, 2.0, 0.1], [0.0, 0.0, np.nan, 0.1]):
         with pytest.raises(OptionError, match="upward unit normal"):
             scanned_object("mug seen", points, T_object_camera, table=wrong)
