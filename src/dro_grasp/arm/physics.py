@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree
 
+from dro_grasp.arm.motion import Trajectory
 from dro_grasp.arm.reachability import Feasible, Postures
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, add_solids, moved, robot_spec, wxyz
@@ -45,6 +46,8 @@ BALL_BIT = 2  # Bit of contacts of an estimated object's balls with the hand (ou
 HULL_BIT = 4  # Bit of contacts of its convex hull with the table (ours)
 STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
 """Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
+FALLEN = 0.02  # Depth from which on what was pushed fell off the table [m] (ours)
+TIPPING_SECONDS = 0.5  # What tips over an edge takes its time [s] (ours)
 UNSEEN = 0.004  # Balls at least this far from all that was seen are of the unseen side [m] (ours)
 FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
@@ -179,6 +182,12 @@ class LiftScene:
                 if watch is not None:
                     watch()
 
+    def follow(self, arm: Trajectory, hand: Trajectory, rows: slice, watch: Callable[[], None] | None = None) -> None:
+        """Let the servos follow some rows of trajectories with the same times; `watch` is called once a tick."""
+        for i in range(rows.start + 1, rows.stop):
+            self.command(arm.position[i], arm.velocity[i], hand.position[i])
+            self.advance(float(arm.time[i] - arm.time[i - 1]), watch)
+
     def touched(self, index: int) -> int:
         """How many links of the hand touch an object."""
         body = self.model.body(object_name(index)).id
@@ -287,11 +296,7 @@ class Rehearsal:
 
         The hand closes as in trials; other numbers are ours.
         """
-        scene, start = self.scene, self.T_world_object.copy()
-        start[:2, 3] += deviation.shift
-        scene.model.opt.gravity[:] = deviation.weight * self._gravity
-        scene.model.geom_friction[:] = deviation.friction * self._friction
-        scene.model.geom_pos[:] = self._places + (deviation.depth - 1) * self._behind
+        scene, start = self.scene, self._start(deviation)
         approach = self._within(goal.approach[::-1], 0.03)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
@@ -309,8 +314,28 @@ class Rehearsal:
         slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
         return scene.in_hand(0) if slip < 0.02 and scene.touched(0) >= FEWEST_LINKS else None
 
+    def push(self, arm: Trajectory, hand: Trajectory, rows: slice, deviation: Deviation) -> bool:
+        """Whether the object stays on the table while the robot follows some rows of trajectories with the same times."""
+        scene, start = self.scene, self._start(deviation)
+        scene.model.opt.noslip_iterations = 0
+        scene.begin(arm.position[rows.start], hand.position[rows.start])
+        scene.place(0, start)
+        scene.follow(arm, hand, rows)
+        scene.advance(TIPPING_SECONDS)
+        down = (start - scene.pose(0))[2] @ [*scene.centre(0), 1.0]
+        return bool(down < FALLEN)
+
+    def _start(self, deviation: Deviation) -> Float[np.ndarray, "4 4"]:
+        """Where the object begins, once the scene deviates."""
+        model, start = self.scene.model, self.T_world_object.copy()
+        start[:2, 3] += deviation.shift
+        model.opt.gravity[:] = deviation.weight * self._gravity
+        model.geom_friction[:] = deviation.friction * self._friction
+        model.geom_pos[:] = self._places + (deviation.depth - 1) * self._behind
+        return start
+
     def _unseen_depths(self, seen: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n 3"]:
-        """How far each ball of the unseen side is behind the middle of the seen one, along the ground; 0 for other shapes [m]."""
+        """How far balls of the unseen side are behind the middle of the seen one, along the ground; 0 for other shapes [m]."""
         model, depths = self.scene.model, np.zeros_like(self._places)
         balls = np.flatnonzero((model.geom_bodyid == model.body(object_name(0)).id) & (model.geom_contype == BALL_BIT))
         centres = self._places[balls] + self.scene.centre(0)

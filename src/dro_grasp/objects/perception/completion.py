@@ -224,8 +224,8 @@ def complete_cloud(
 
     Points of the visible side [m] have outward unit normals; if all lie on one viewing ray, they are returned unchanged.
     Without the position of the `camera` [m], they are all on one side of a plane, whose normal is the mean of theirs.
-    Symmetries that preserve the `up` direction, if it is known, are preferred. What stands on the plane of a `table`, its upward
-    normal and its height along it [m], reaches down to it. The shipped network chooses between symmetries by default.
+    Symmetries that preserve the `up` direction, if it is known, are preferred. What stands on the plane of a `table`, its
+    upward normal and its height along it [m], reaches down to it. The shipped network chooses between symmetries by default.
     """
     side, axes, middle = to_view_axes(points, normals, camera, table)
     if side.width < THINNEST:
