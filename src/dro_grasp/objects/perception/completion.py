@@ -24,6 +24,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
+from dro_grasp.objects.perception.resting import set_down
 from dro_grasp.objects.surface_distances import cloud_distances
 
 SAMPLE = 300  # Visible points that judge a symmetry (ours)
