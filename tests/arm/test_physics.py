@@ -157,30 +157,6 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 
-def test_a_rehearsal_may_have_another_unseen_side(
-    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
-) -> None:
-    """Against a naive twin: balls that face away from the camera move along x, in proportion to how far back they are."""
-    planned = plan(robot, ball, grasps=grasps, config=PlanConfig(rehearsals=0))
-    goal = Feasible(planned.notes.chosen, planned.arm.position[planned.part("approach")][::20],
-                    planned.arm.position[planned.part("lift")][::10])
-    seen = ball.cloud[ball.cloud[:, 0] < 0.45]
-    rehearsal = Rehearsal(Workcell(robot, (), replace(ball, seen=seen)))
-    model = rehearsal.scene.model
-    before, body = model.geom_pos.copy(), model.body("object0-").id
-    rehearsal.grip(goal, Postures.of(robot, grasps, goal.index), Deviation(depth=0.8))
-    moved = model.geom_pos - before
-    x = before[:, 0] + 0.45  # the ball's centre of mass is at its middle
-    behind = np.flatnonzero(np.linalg.norm(moved, axis=1) > 1e-9)
-    assert len(behind) > 50
-    assert (model.geom_bodyid[behind] == body).all()
-    assert x[behind].min() > 0.45 - 1e-3
-    np.testing.assert_allclose(moved[behind, 0], -0.2 * (x[behind] - seen[:, 0].mean()), atol=5e-4)
-    assert np.abs(moved[behind][:, 1:]).max() < 5e-4
-    rehearsal.grip(goal, Postures.of(robot, grasps, goal.index), DEVIATIONS[0])
-    np.testing.assert_array_equal(model.geom_pos, before)
-
-
 def test_where_none_holds_the_best_score_is_taken_all_the_same(
     robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
 ) -> None:
