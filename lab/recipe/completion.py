@@ -2,10 +2,11 @@
 
     python -m lab.recipe.completion --folder FOLDER [--output FILE] [--objects GROUP ...] [--steps N] [--workers N]
 
-Each object is viewed in its own and in stretched shapes, as half of a cloud and by a depth camera, from many sides. The
-network learns its true signed distance near its surface, near the surfaces that symmetries guess, and around both. The
-folder keeps the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the
-network that is written is fitted to all. Assets are needed where objects are of them.
+Each object is viewed in its own and in stretched shapes, as half of a cloud, by a depth camera from many sides, and by one
+that sees it stand on a table. Cameras have no noise, that of each pixel alone, or that of a kind of camera. The network learns
+the object's true signed distance near its surface, near the surfaces that symmetries guess, and around both. The folder keeps
+the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the network that is
+written is fitted to all. Assets are needed where objects are of them.
 """
 
 from __future__ import annotations
@@ -25,20 +26,22 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.network.completion_network import SHIPPED, SurfaceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.objects.loading import mesh_object
+from dro_grasp.objects.loading import estimate_normals, mesh_object
 from dro_grasp.objects.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
-from dro_grasp.objects.perception.partial_views import DepthCamera, visible_side
+from dro_grasp.objects.perception.depth_noise import NoiseName
+from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
+from dro_grasp.objects.perception.scan import without_outliers
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
 from dro_grasp.provenance import made_by
 from lab.recipe.parts import fill, fingerprint
 
-Kind = Literal["half", "depth"]
-KINDS: tuple[Kind, ...] = ("half", "depth")
+Kind = Literal["half", "depth", "table"]
+KINDS: tuple[Kind, ...] = ("half", "depth", "table")
 """Kinds of view."""
 SHAPES = 5
 """Shapes of each object; the first is its own, the others are stretched."""
-SIDES = 4
+SIDES = 3
 """Views of each shape of each kind."""
 PLACES = 1536
 """Points with a true distance in a view."""
@@ -50,14 +53,26 @@ AROUND = 0.02
 """Margin of the other points beyond both surfaces [m]."""
 AWAY = 0.006
 """Points at least this far from all seen points are unseen [m]."""
-DISTANCE = (0.35, 0.7)
+DISTANCE = (0.35, 1.0)
 """Range of the cameras' distances [m]."""
+PIXEL = (0.002, 0.0036)
+"""Range of the angle between pixels [rad]."""
 NOISE = (0.0, 0.0015)
-"""Range of the cameras' noise [m]."""
+"""Range of the noise of each pixel alone [m]."""
+KNOWN: tuple[NoiseName, ...] = ("none", "structured_light", "time_of_flight", "stereo")
+"""Kinds of cameras; each has a view in five, as has noise of each pixel alone."""
+ELEVATION = (0.35, 1.3)
+"""Range of the angles of views of a table [rad]."""
+CUT = (0.002, 0.006)
+"""Range of the heights above a table below which points are cut off with it [m]."""
+LEVEL = 0.001
+"""Standard deviation of the height at which a table is found [m]."""
 FEWEST = 40
 """Fewest seen points of a view that is used."""
 STANDING = 0.5
-"""Share of depth images with a known up direction."""
+"""Share of depth images without a table with a known up direction."""
+RESTING = 0.7
+"""Share of them in which the object rests as it may come to rest by itself; in the others, its own z axis is up."""
 FARTHEST = 0.03
 """Distances are clamped to plus and minus this [m]."""
 VIEWS = 32
@@ -97,19 +112,61 @@ def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
     return mesh_object(obj.name, mesh, origin=obj.name)
 
 
-def view_of(
-    obj: ObjectModel, kind: Kind, rng: np.random.Generator
-) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
-    """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
-    camera = DepthCamera(distance=rng.uniform(*DISTANCE), noise=rng.uniform(*NOISE))
-    points, normals, place = visible_side(obj, kind, int(rng.integers(1 << 30)), camera)
+def camera_of(rng: np.random.Generator) -> DepthCamera:
+    """A depth camera of a random kind at a random distance."""
+    kind, distance = int(rng.integers(len(KNOWN) + 1)), rng.uniform(*DISTANCE)
+    noise = rng.uniform(*NOISE) if kind == len(KNOWN) else KNOWN[kind]
+    return DepthCamera(distance=distance, pixel=distance * rng.uniform(*PIXEL), noise=noise)
+
+
+class Seen(NamedTuple):
+    """What is known of an object, in its frame."""
+
+    points: Float[np.ndarray, "n 3"]
+    """The visible side [m]."""
+    normals: Float[np.ndarray, "n 3"]
+    """Its normals."""
+    camera: Float[np.ndarray, "3"] | None
+    """Place of the camera [m]."""
+    up: Float[np.ndarray, "3"] | None
+    """Upward direction."""
+    table: Float[np.ndarray, "4"] | None
+    """Plane on which it stands: upward normal, and height along it [m]."""
+
+
+def seen_of(obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.random.Generator) -> Seen | None:
+    """One view of an object, which stands on a table with `up` upward if it does; None if too little is seen."""
+    camera, seed = camera_of(rng), int(rng.integers(1 << 30))
+    if kind == "half":
+        return Seen(*visible_side(obj, kind, seed), None, None)
+    towards = rng.normal(size=3)
+    if kind == "table":
+        angle, flat = rng.uniform(*ELEVATION), np.cross(up, towards)
+        towards = np.sin(angle) * up + np.cos(angle) * flat / np.linalg.norm(flat)
+    height = float((obj.vertices @ up).min())
+    points = visible_points(obj, towards, torch.Generator().manual_seed(seed), camera).numpy().astype(np.float64)
+    if kind == "table":
+        points = points[points @ up - height > rng.uniform(*CUT)]
     if len(points) < FEWEST:
         return None
-    side, axes, middle = to_view_axes(points, normals, place)
+    points, place = without_outliers(points), camera.place(obj, torch.from_numpy(towards))
+    normals = estimate_normals(points.astype(np.float32), place).astype(np.float64)
+    table = np.append(up, height + LEVEL * rng.normal()) if kind == "table" else None
+    known = table is not None or rng.uniform() < STANDING
+    return Seen(points, normals, place, up if known else None, table)
+
+
+def view_of(
+    obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.random.Generator
+) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
+    """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
+    seen = seen_of(obj, kind, up, rng)
+    if seen is None or len(seen.points) < FEWEST:
+        return None
+    side, axes, middle = to_view_axes(seen.points, seen.normals, seen.camera, seen.table)
     if side.width < THINNEST:
         return None
-    up = axes[2] if place is not None and rng.uniform() < STANDING else None
-    guesses = side.guesses(up, GUESSES)
+    guesses = side.guesses(None if seen.up is None else seen.up @ axes, GUESSES)
     true = (obj.cloud - middle) @ axes
     guessed = np.concatenate([g.points for g in guesses])
     both, n = np.concatenate([true, guesses[0].points]), PLACES // 3
@@ -123,6 +180,13 @@ def view_of(
     return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
 
 
+def resting(obj: ObjectModel, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """A direction that is upward where the object rests, the surest ones most often."""
+    hull = trimesh.Trimesh(obj.vertices, obj.faces, process=False).convex_hull
+    poses, shares = trimesh.poses.compute_stable_poses(hull, center_mass=obj.centre_of_mass, n_samples=1, threshold=0.0)
+    return poses[rng.choice(len(poses), p=shares / shares.sum())][2, :3]
+
+
 def collect(shapes: int, given: tuple[str, int]) -> tuple[tuple[Tensor, ...], str]:
     """Views of the object of this name, seen with this seed, and of its stretched shapes, and what to print of them."""
     label, seed = given
@@ -134,7 +198,8 @@ def collect(shapes: int, given: tuple[str, int]) -> tuple[tuple[Tensor, ...], st
             print(f"{label}: {error}")
             continue
         for k, kind in enumerate(KINDS):
-            views = [view for view in (view_of(obj, kind, rng) for _ in range(SIDES)) if view is not None]
+            ups = [resting(obj, rng) if rng.uniform() < RESTING else np.eye(3)[2] for _ in range(SIDES)]
+            views = [view for view in (view_of(obj, kind, up, rng) for up in ups) if view is not None]
             found += views
             kinds += [k] * len(views)
     guessed, features, truth, unseen = (torch.stack(column) for column in zip(*found, strict=True))

@@ -18,7 +18,7 @@ from dro_grasp.arm.motion import MotionPlan, grasps_and_dropped
 from dro_grasp.arm.placing import Place
 from dro_grasp.arm.planner import Tries, first_trusted, plan
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.sliding import AT_TABLE, slide
+from dro_grasp.arm.sliding import AT_TABLE, SlideConfig, slide
 from dro_grasp.arm.task import PlanConfig, Task
 from dro_grasp.arm.workcell import moved
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
@@ -109,7 +109,8 @@ def _ways(
         return lambda: _trusted(robot, obj, obstacles, predictor, config, seed, start, place, grasps)
 
     def pushed() -> MotionPlan:
-        return slide(robot, obj, obstacles, seed=seed, start=None if start is None else robot.require_start(start))
+        slides = SlideConfig(rehearsed=config.rehearsals > 0, friction=config.friction)
+        return slide(robot, obj, obstacles, slides, seed, None if start is None else robot.require_start(start))
 
     if overhangs(points, table):
         at_edge = replace(config, reach=replace(AT_TABLE, lift=config.reach.lift), rehearsals=config.rehearsals and REHEARSED)

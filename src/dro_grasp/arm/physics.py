@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from dro_grasp.arm.motion import Trajectory
 from dro_grasp.arm.reachability import Feasible, Postures
 from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, add_solids, moved, robot_spec, wxyz
@@ -45,6 +46,8 @@ BALL_BIT = 2  # Bit of contacts of an estimated object's balls with the hand (ou
 HULL_BIT = 4  # Bit of contacts of its convex hull with the table (ours)
 STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
 """Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
+FALLEN = 0.02  # Depth from which on what was pushed fell off the table [m] (ours)
+TIPPING_SECONDS = 0.5  # What tips over an edge takes its time [s] (ours)
 FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
@@ -173,6 +176,12 @@ class LiftScene:
                 if watch is not None:
                     watch()
 
+    def follow(self, arm: Trajectory, hand: Trajectory, rows: slice, watch: Callable[[], None] | None = None) -> None:
+        """Let the servos follow some rows of trajectories with the same times; `watch` is called once a tick."""
+        for i in range(rows.start + 1, rows.stop):
+            self.command(arm.position[i], arm.velocity[i], hand.position[i])
+            self.advance(float(arm.time[i] - arm.time[i - 1]), watch)
+
     def touched(self, index: int) -> int:
         """How many links of the hand touch an object."""
         body = self.model.body(object_name(index)).id
@@ -279,10 +288,7 @@ class Rehearsal:
 
         The hand closes as in trials; other numbers are ours.
         """
-        scene, start = self.scene, self.T_world_object.copy()
-        start[:2, 3] += deviation.shift
-        scene.model.opt.gravity[:] = deviation.weight * self._gravity
-        scene.model.geom_friction[:] = deviation.friction * self._friction
+        scene, start = self.scene, self._start(deviation)
         approach = self._within(goal.approach[::-1], 0.03)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
@@ -299,6 +305,26 @@ class Rehearsal:
         self._follow(rows[-1:], hand.squeeze[None], 0.3)
         slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
         return scene.in_hand(0) if slip < 0.02 and scene.touched(0) >= FEWEST_LINKS else None
+
+    def push(self, arm: Trajectory, hand: Trajectory, rows: slice, deviation: Deviation) -> bool:
+        """Whether the object stays on the table while the robot follows some rows of trajectories with the same times."""
+        scene, start = self.scene, self._start(deviation)
+        scene.model.opt.noslip_iterations = 0
+        scene.begin(arm.position[rows.start], hand.position[rows.start])
+        scene.place(0, start)
+        body = scene.data.body(object_name(0))
+        height = float(body.xpos[2])
+        scene.follow(arm, hand, rows)
+        scene.advance(TIPPING_SECONDS)
+        return bool(body.xpos[2] > height - FALLEN)
+
+    def _start(self, deviation: Deviation) -> Float[np.ndarray, "4 4"]:
+        """Where the object begins, once the scene deviates."""
+        model, start = self.scene.model, self.T_world_object.copy()
+        start[:2, 3] += deviation.shift
+        model.opt.gravity[:] = deviation.weight * self._gravity
+        model.geom_friction[:] = deviation.friction * self._friction
+        return start
 
     def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:
         """The first configurations of a straight line, and one step of it at least."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.arm.flat_grips import LEAST_OVERHANG, farthest_ahead, flat_grasps
 from dro_grasp.arm.motion import MotionPlan, PlanNotes, PlanScene
+from dro_grasp.arm.physics import FRICTION, Deviation, Rehearsal
 from dro_grasp.arm.postures import ACROSS, AHEAD, OVER, WorkingHand
 from dro_grasp.arm.reachability import Reachability, ReachConfig, WristSolver
 from dro_grasp.arm.robot import Robot, Table
@@ -72,6 +74,12 @@ class SlideConfig(Checked):
     """Grasps at the edge of which the arm has to reach one, before a thing is pushed there."""
     path_seconds: float = 2.0
     """Longest time for a path to the thing, and for the way home [s]."""
+    rehearsed: bool = True
+    """Whether pushes after which it falls off the table, when they are simulated on what is known of it, are left out."""
+    friction: float = FRICTION
+    """Coefficient of friction between hand, thing and table, for that."""
+    deviations: tuple[Deviation, ...] = (Deviation(), Deviation((0.004, 0.004), 0.8), Deviation((-0.004, -0.004), 0.8))
+    """How the simulated pushes deviate from what is known."""
     reach: ReachConfig = field(default_factory=lambda: AT_TABLE)
     """How the thing is approached at the edge."""
 
@@ -140,7 +148,7 @@ def slide(
         start: Where the arm's joints are [rad or m]; home by default.
 
     Raises:
-        PlanError: No edge is within reach.
+        PlanError: No edge is within reach, or the thing would fall off the table.
         OptionError: The hand has no thumb and two fingers.
     """
     config, table = config or SlideConfig(), robot.table
@@ -152,8 +160,11 @@ def slide(
         if not pusher.is_free(push) or not pusher.can_take(push):
             continue
         for line in pusher.lines(push):
-            if (made := pusher.motion(push, line)) is not None:
+            if (made := pusher.motion(push, line)) is not None and pusher.is_safe(made):
                 return made
+    if pusher.unsafe:
+        raise PlanError(f"'{obj.name}' lies flat, and falls off the table in all {pusher.unsafe} pushes to an edge that were "
+                        "simulated; move it nearer to the robot, or to another edge")
     raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table to which it could be pushed; move it "
                     "nearer to an edge that the robot reaches around, or correct the table's centre and size in the robot file")
 
@@ -180,6 +191,7 @@ class _Pusher:
         # Round tips: what meets the thing is as low as it is.
         self.tips = tips[tips[:, AHEAD] > tips[:, AHEAD].max() - max(LOWEST, float(np.ptp(self.points[:, 2])))]
         self.ahead = farthest_ahead(self.working, self.working.pointing)
+        self.unsafe = 0  # Pushes that were left out because the thing falls
 
     def is_free(self, push: Push) -> bool:
         """Whether nothing else is where the thing and the fingers come along."""
@@ -251,6 +263,18 @@ class _Pusher:
             if pressed is not None:
                 return before[::-1].copy(), pressed, after
         return None
+
+    def is_safe(self, made: MotionPlan) -> bool:
+        """Whether the thing stays on the table when it is pushed so in simulation."""
+        rows = slice(made.part("approach").start, made.part("retreat").stop)
+        safe = not self.config.rehearsed or all(
+            self._rehearsal.push(made.arm, made.hand, rows, deviation) for deviation in self.config.deviations)
+        self.unsafe += not safe
+        return safe
+
+    @cached_property
+    def _rehearsal(self) -> Rehearsal:
+        return Rehearsal(self.cell, friction=self.config.friction)
 
     def motion(self, push: Push, line: Line) -> MotionPlan | None:
         """The timed stages; None if there is no way to the thing or home from it."""

@@ -19,7 +19,7 @@ from dro_grasp.arm.attempts import Attempt
 from dro_grasp.arm.camera_view import depth_image, thinned_intrinsics
 from dro_grasp.arm.flat_plans import may_slide, plan_or_slide
 from dro_grasp.arm.motion import PLACING, SLIDING, STAGES, MotionPlan
-from dro_grasp.arm.physics import FRICTION, TICK, Deviation, LiftScene, check_friction
+from dro_grasp.arm.physics import FALLEN, FRICTION, TICK, Deviation, LiftScene, check_friction
 from dro_grasp.arm.placed import draw_place, measured, place_fault
 from dro_grasp.arm.planner import plan
 from dro_grasp.arm.reachability import ReachConfig
@@ -42,7 +42,6 @@ LABEL = "tabletop/5 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 6  # Most pushes of a flat thing towards an edge (ours)
-FALLEN = 0.02  # Depth below the table from which on it fell off [m] (ours)
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ def attempt(
 def _pushed(result: Attempt, scene: LiftScene, made: MotionPlan, watch: Watcher | None) -> Attempt:
     """An attempt after a push to the table's edge."""
     for stage in SLIDING:
-        _follow(scene, made, stage, None if watch is None else lambda: watch.moved(scene))
+        scene.follow(made.arm, made.hand, made.part(stage), None if watch is None else lambda: watch.moved(scene))
     table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
     if scene.pose(0)[2, 3] < table.height - FALLEN:
         return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
@@ -219,7 +218,7 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
     start = scene.pose(0)
     call = None if watch is None else lambda: watch.moved(scene)
     for stage in STAGES:
-        _follow(scene, made, stage, call)
+        scene.follow(made.arm, made.hand, made.part(stage), call)
         if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
@@ -243,14 +242,6 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
     return "done", ""
 
 
-def _follow(scene: LiftScene, made: MotionPlan, stage: str, call: Callable[[], None] | None) -> None:
-    """Let the servos follow one stage of a plan."""
-    rows = made.part(stage)
-    for i in range(rows.start + 1, rows.stop):
-        scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
-        scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
-
-
 def _slipped(scene: LiftScene, grip: Float[np.ndarray, "4 4"]) -> str:
     """How far the object has moved in the hand since it was held there, if that is too far."""
     slip = _apart(scene.in_hand(0), grip)
@@ -262,7 +253,7 @@ def _put_down(scene: LiftScene, made: MotionPlan, call: Callable[[], None] | Non
     """Let the servos follow the stages after the lift, and wait; where it ended, and why if it failed."""
     grip = scene.in_hand(0)
     for stage in PLACING:
-        _follow(scene, made, stage, call)
+        scene.follow(made.arm, made.hand, made.part(stage), call)
         if stage == "carry" and (slipped := _slipped(scene, grip)):
             return stage, slipped
     scene.advance(SETTLE_SECONDS, call)

@@ -142,7 +142,7 @@ def test_where_the_network_finds_no_surface_the_best_guess_stays() -> None:
     points, normals, _ = box()
     camera = np.array([0.36, 0.29, 0.38])
     shown = facing(points, normals, camera)
-    network = SurfaceNetwork(GUESSES, 20)
+    network = SurfaceNetwork(GUESSES, shipped_surface().enter.in_features)
     with torch.no_grad():
         # Everything is a metre away.
         network.leave.bias[GUESSES] = 100.0
@@ -230,6 +230,43 @@ def test_a_ball_in_a_real_depth_image() -> None:
     assert np.mean(off) < 0.1 * radius
     assert np.quantile(off, 0.95) < 0.25 * radius
     assert np.mean((whole.normals * whole.points).sum(1) / length) > 0.95
+
+
+def test_nothing_is_thought_below_a_table() -> None:
+    """A low block on a table: upside down below it, it agrees with what was seen, unless the table is known."""
+    points, normals, _ = box()
+    camera = np.array([0.3, 0.25, 0.45])
+    shown = facing(points, normals, camera) & (points[:, 2] > 0.02)
+    table = np.array([0.0, 0.0, 1.0, 0.02])
+    side, axes, middle = to_view_axes(points[shown], normals[shown], camera, table)
+    bare, _, _ = to_view_axes(points[shown], normals[shown], camera)
+    assert side.table is not None
+    places = np.random.default_rng(0).uniform(-0.08, 0.08, (500, 3))
+    height = places[:, 2] - 0.02
+    local = (places - middle) @ axes
+    np.testing.assert_allclose(local @ side.table[:3] - side.table[3], height, atol=1e-12)
+    guesses = bare.guesses(None, GUESSES)
+    told, untold = (surface_features(one, guesses, local).features.double().numpy() for one in (side, bare))
+    changed = np.flatnonzero(np.abs(told - untold).max(0) > 0)
+    np.testing.assert_allclose(told[:, changed[0]], np.arcsinh(height / 0.01) / 2, atol=1e-6)
+    assert np.unique(told[:, changed[1:]]).tolist() == [1.0], "that there is one"
+    # The mirror in the table costs as much more as its points are below, beyond noise, three times a width.
+    up = axes.T @ table[:3]
+    mirror, centre = np.eye(3) - 2 * np.outer(up, up), up * side.table[3]
+    moved = (side.points[side.sample] - centre) @ mirror.T + centre
+    assert (moved @ up < side.table[3] + 1e-9).all()
+    assert side.cost(mirror, centre) > bare.cost(mirror, centre) + 0.1
+
+
+def test_pixels_are_as_far_apart_as_those_of_the_camera() -> None:
+    ball = load_object("sphere")
+    camera = DepthCamera(distance=0.8, pixel=0.0028, noise="stereo")
+    view = torch.tensor([0.0, 0.0, 1.0])
+    points = visible_points(ball, view, torch.Generator().manual_seed(0), camera).double().numpy()
+    place = camera.place(ball, view)
+    side, _, middle = to_view_axes(points, points / np.linalg.norm(points, axis=1, keepdims=True), place)
+    assert side.pitch == pytest.approx(0.0028 * np.linalg.norm(place - middle) / 0.8, rel=0.02)
+    assert to_view_axes(points, points, None)[0].pitch == 0
 
 
 @pytest.mark.parametrize("end", [(0.05, 0.0, 0.5), (0.0, 0.0, 0.6)], ids=["across", "along the ray"])

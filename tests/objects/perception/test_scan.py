@@ -280,6 +280,21 @@ def test_a_ball_keeps_its_outline_and_loses_strays() -> None:
     assert KDTree(stray).query(cleaned)[0].min() > 0, "no stray is left"
 
 
+def test_a_table_that_is_known_is_where_the_object_stands(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    points = depth_points(depth, INTRINSICS)
+    R, t = T_object_camera[:3, :3], T_object_camera[:3, 3]
+    low = float((points @ R.T + t)[:, 2].min())
+    plane = np.append(R[2], low - t[2])
+    scan = scanned_object("mug seen", points, T_object_camera, table=plane, keep_table=True)
+    assert scan.table is not None
+    np.testing.assert_allclose(scan.table, [0, 0, 1, low], atol=1e-9)
+    assert scan.seen is not None
+    assert low - 1e-6 < scan.cloud[:, 2].min() < low + 0.003, "its unseen side reaches down to the table"
+    for wrong in ([0.0, 0.0, 1.0], [0.0, 0.0, 2.0, 0.1], [0.0, 0.0, np.nan, 0.1]):
+        with pytest.raises(OptionError, match="upward unit normal"):
+            scanned_object("mug seen", points, T_object_camera, table=wrong)
+
+
 @pytest.fixture(scope="module")
 def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What grasps a cloud in the frame of a camera file from above, without what makes good grasps."""

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
+from dro_grasp.objects.perception.resting import set_down
 from dro_grasp.objects.surface_distances import cloud_distances
 
 SAMPLE = 300  # Visible points that judge a symmetry (ours)
@@ -67,10 +68,13 @@ class VisibleSide:
     width: float  # smallest extent in the image [m]
     end: float  # height below which nothing is visible [m]
     top: float  # height above which nothing is visible [m]
+    pitch: float = 0.0  # distance of neighbouring pixels at the object; 0 without a camera [m]
+    table: Float[np.ndarray, "4"] | None = None  # plane on which the object stands: upward normal, and height along it [m]
 
     @classmethod
     def of(
-        cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera_distance: float | None
+        cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera_distance: float | None,
+        pitch: float = 0.0, table: Float[np.ndarray, "4"] | None = None,
     ) -> VisibleSide:
         """Find the rim, and predict how the surface continues there."""
         # In an image, a point belongs to the rim if its neighbours lie to one side of it. A cloud cut by a plane has its rim
@@ -97,7 +101,8 @@ class VisibleSide:
         expected = facing * np.where(facing < TURNS_AWAY, width, flat)
         # In an image normals are less certain than at a cut (ours).
         smooth = 0.5 * (1 - facing) if camera_distance is None else 0.1 * np.clip(1 - facing / TURNS_AWAY, 0, 1)
-        return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
+        return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top),
+                   pitch, table)
 
     def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
         """Both sides by the best symmetries that differ, best first; those that preserve `up` [view axes] are preferred."""
@@ -172,12 +177,14 @@ class VisibleSide:
         return KDTree(project(self.points, self.camera_distance))
 
     def _exposure(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-        """Distance of points from where they would be hidden from the camera [m]: inside the image, behind the surface."""
+        """Distance of points from where they may be hidden [m]: in the image, behind the surface, above the table."""
         if self.camera_distance is None:
             return np.where(moved[:, 2] > self.end, self.tree.query(moved)[0], 0.0)
         aside, nearest = self.image_tree.query(project(moved, self.camera_distance))
         before = moved[:, 2] - self.points[nearest, 2]
-        return np.hypot(np.maximum(0, aside - TOLERANCE), np.maximum(0, before - TOLERANCE))
+        under = np.zeros(len(moved)) if self.table is None else self.table[3] - moved @ self.table[:3]
+        outside = [np.maximum(0, way - TOLERANCE) for way in (aside, before, under)]
+        return np.linalg.norm(outside, axis=0)
 
 
 GUESSES = 5  # Symmetries that the network chooses between (ours)
@@ -202,24 +209,26 @@ class SurfaceFeatures(NamedTuple):
     """Input of the network at n places."""
 
     guessed: Float[Tensor, "n 5"]  # signed distances to the guesses [m]
-    features: Float[Tensor, "n 20"]
+    features: Float[Tensor, "n 23"]
     """The same distances, squeezed by asinh. Squeezed likewise: distance to the nearest visible point, height over its tangent
-    plane, distance from the image, height over the surface there, heights above the end and the top of the visible side.
-    Then: position along the view and across it, the cost of each guess, the visible width, and whether there is a camera."""
+    plane, distance from the image, height over the surface there, heights above the end and the top of the visible side, height
+    above the table, distance of neighbouring pixels. Then: position along the view and across it, the cost of each guess, the
+    visible width, and whether there is a camera, and a table."""
 
 
 def complete_cloud(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None,
     up: Float[np.ndarray, "3"] | None = None, network: SurfaceNetwork | None = None,
+    table: Float[np.ndarray, "4"] | None = None,
 ) -> CompletedCloud:
     """Complete the unseen side. Both sides get about the same density, for which visible points are thinned.
 
     Points of the visible side [m] have outward unit normals; if all lie on one viewing ray, they are returned unchanged.
     Without the position of the `camera` [m], they are all on one side of a plane, whose normal is the mean of theirs.
-    Symmetries that preserve the `up` direction, if it is known, are preferred; the shipped network chooses between them by
-    default.
+    Symmetries that preserve the `up` direction, if it is known, are preferred. What stands on the plane of a `table`, its
+    upward normal and its height along it [m], reaches down to it. The shipped network chooses between symmetries by default.
     """
-    side, axes, middle = to_view_axes(points, normals, camera)
+    side, axes, middle = to_view_axes(points, normals, camera, table)
     if side.width < THINNEST:
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(None if up is None else up @ axes, GUESSES)
@@ -235,13 +244,23 @@ def complete_cloud(
     share = min(1.0, len(seen) / max(1, int(near.sum())))
     added = np.flatnonzero(~near)[: round(share * int((~near).sum()))]
     both, both_normals = np.concatenate([seen, surface[added]]), np.concatenate([seen_normals, outward[added]])
-    return CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
+    whole = CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
+    return whole if table is None else stood(whole, table)
+
+
+def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"]) -> CompletedCloud:
+    """The cloud with its unseen side down to the table, and not below it."""
+    kept = ~whole.added | (whole.points @ table[:3] > table[3])
+    points, normals, added = (column[kept] for column in whole)
+    return CompletedCloud(*set_down(points, normals, added, table), added)
 
 
 def to_view_axes(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None,
+    table: Float[np.ndarray, "4"] | None = None,
 ) -> tuple[VisibleSide, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """The visible side in view axes, with z to the camera; these axes as columns; and their origin, the middle [m]."""
+    pitch = 0.0 if camera is None else _pitch(points, camera)
     if len(points) > VISIBLE_POINTS:
         kept = np.random.default_rng(0).permutation(len(points))[:VISIBLE_POINTS]
         points, normals = points[kept], normals[kept]
@@ -252,7 +271,20 @@ def to_view_axes(
     helper = np.eye(3)[np.abs(view).argmin()]
     across = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
     axes = np.stack([across, np.cross(view, across), view], 1)
-    return VisibleSide.of((points - middle) @ axes, normals @ axes, None if camera is None else length), axes, middle
+    if table is not None:
+        table = np.append(table[:3] @ axes, table[3] - table[:3] @ middle)
+    distance = None if camera is None else length
+    return VisibleSide.of((points - middle) @ axes, normals @ axes, distance, pitch, table), axes, middle
+
+
+def _pitch(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> float:
+    """Distance of neighbouring pixels at the object's middle [m]: the median angle between neighbouring rays."""
+    if len(points) < 2:
+        return 0.0
+    rays = points - camera
+    length = np.linalg.norm(rays, axis=1)
+    rays = rays / length[:, None]
+    return float(np.median(KDTree(rays).query(rays, k=2)[0][:, 1]) * length.mean())
 
 
 def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.ndarray, "n 3"]) -> SurfaceFeatures:
@@ -262,10 +294,13 @@ def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.n
     over = ((places - side.points[nearest]) * side.normals[nearest]).sum(1)
     beside, hiding = side.image_tree.query(project(places, side.camera_distance))
     height = places[:, 2]
+    stands = np.zeros(len(places)) if side.table is None else places @ side.table[:3] - side.table[3]
     metres = np.column_stack([
-        guessed, distance, over, beside, height - side.points[hiding, 2], height - side.end, height - side.top])
+        guessed, distance, over, beside, height - side.points[hiding, 2], height - side.end, height - side.top, stands,
+        np.full(len(places), side.pitch)])
     across = np.linalg.norm(places[:, :2], axis=1)
-    whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, float(side.camera_distance is not None)])
+    known = float(side.camera_distance is not None), float(side.table is not None)
+    whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, *known])
     features = np.column_stack([
         np.arcsinh(metres / SMALL) / 2, height / LENGTH, across / LENGTH, np.broadcast_to(whole, (len(places), len(whole)))])
     return SurfaceFeatures(torch.from_numpy(guessed).float(), torch.from_numpy(features).float())

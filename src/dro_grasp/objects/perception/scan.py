@@ -135,7 +135,7 @@ def load_scan(
 @checked
 def scanned_object(
     name: str, points: ArrayLike, T_frame_camera: ArrayLike | None = None, denoise: bool = True, complete: bool = True,
-    keep_table: bool = False, up: ArrayLike | None = None,
+    keep_table: bool = False, up: ArrayLike | None = None, table: ArrayLike | None = None,
 ) -> ObjectModel:
     """An object from the points of a camera at the origin; its grasps are in the given frame.
 
@@ -151,32 +151,45 @@ def scanned_object(
         complete: Add the unseen side; switch it off for a scan from all sides.
         keep_table: Keep every point. By default a table in the cloud is found and cut off, with a note, and hands stay above
             it.
-        up: The upward direction in the camera's frame, (3,), which completion prefers; by default the wanted frame's z axis.
+        up: The upward direction in the camera's frame, (3,), which completion prefers; by default the normal of the table,
+            or the wanted frame's z axis.
+        table: The plane on which the object stands, where it is cut off already: upward unit normal and height along it, (4,),
+            in the camera's frame [m].
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
-        OptionError: The pose is no rigid motion.
+        OptionError: The pose is no rigid motion, or the table no plane.
     """
     from dro_grasp.objects.perception.completion import complete_cloud  # it takes a while, and scenes import this
 
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
     clean = _cleaned(given_points(points, name), name, denoise, keep_table)
-    kept, table, camera = clean.rows[:, :3], clean.table, np.zeros(3)
+    kept, camera = clean.rows[:, :3], np.zeros(3)
+    plane = clean.table if table is None else _given_plane(table)
     normals, odd = facing_normals(clean.rows, name)
     if normals is None:
         normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
     if complete:
-        upward = numbers(up, "up").astype(np.float64) if up is not None else None if T is None else T[2, :3]
-        kept, normals, added = complete_cloud(kept, normals, camera, upward)
+        level = plane[:3] if plane is not None else None if T is None else T[2, :3]
+        upward = level if up is None else numbers(up, "up").astype(np.float64)
+        kept, normals, added = complete_cloud(kept, normals, camera, upward, table=plane)
     if T is not None:
         R, t = T[:3, :3], T[:3, 3]
         kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
-        table = None if table is None else moved_plane(table, T)
+        plane = None if plane is None else moved_plane(plane, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
-    cut_off = () if table is None else (table_note(table, clean.cut, clean.total),)
-    return replace(obj, table=table, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
+    cut_off = () if plane is None or clean.table is None else (table_note(plane, clean.cut, clean.total),)
+    return replace(obj, table=plane, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
+
+
+def _given_plane(table: ArrayLike) -> Float[np.ndarray, "4"]:
+    plane = numbers(table, "table").astype(np.float64)
+    if plane.shape != (4,) or not np.isfinite(plane).all() or abs(float(np.linalg.norm(plane[:3])) - 1) > 1e-3:
+        raise OptionError(f"table is {plane.tolist()}; give its upward unit normal and its height along it, four numbers in "
+                          "the camera's frame, in metres")
+    return plane
 
 
 class Cleaned(NamedTuple):
