@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.robot import load_robot
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.tabletop import TabletopConfig, depth_image, scatter, thinned_intrinsics
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.objects.catalogue import load_object
