@@ -20,8 +20,8 @@ from dro_grasp.arm.attempts import Attempt, read_attempts
 from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.tabletop import TabletopConfig, carry_out
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, render
