@@ -21,7 +21,7 @@ from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.postures import AHEAD, OVER, WorkingHand, flat_grips
 from dro_grasp.arm.robot import Robot, Table
 from dro_grasp.arm.sliding import SlideConfig, pushes, slide
-from dro_grasp.arm.tabletop import TabletopConfig, _follow, attempt, carry_out
+from dro_grasp.arm.tabletop import TabletopConfig, attempt, carry_out
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.hands.hand import Hand
@@ -189,13 +189,26 @@ def test_a_push_ends_in_an_overhang(narrow: Robot, pushed: tuple[dro.ObjectModel
     scene = LiftScene(Workcell(narrow), [thing])
     scene.place(0, np.eye(4))
     for stage in SLIDING:
-        _follow(scene, made, stage, None)
+        scene.follow(made.arm, made.hand, made.part(stage))
     T = scene.pose(0)
     out = overhang(thing.vertices @ T[:3, :3].T + T[:3, 3], narrow.table)  # type: ignore[arg-type]
     assert 0.015 < out.max() < 0.07
     assert T[2, 2] > 0.999
     assert np.abs(scene.joints()[0] - narrow.home).max() < 0.02
     assert not scene.touched(0)
+
+
+def test_pushes_that_end_on_the_floor_are_left_out(narrow: Robot) -> None:
+    """A naive twin pushes without looking ahead: the thing falls."""
+    thing = board((0.11, 0.09, 0.005), (0.4, -0.1), 0.3)
+    far = SlideConfig(share=0.9, most=0.09, balance=-0.03, turns=(0.0,), rehearsed=False)
+    made = slide(narrow, thing, config=far)
+    scene = LiftScene(Workcell(narrow), [thing])
+    scene.place(0, np.eye(4))
+    scene.follow(made.arm, made.hand, slice(0, made.part("retreat").stop))
+    assert scene.pose(0)[2, 3] < -0.1
+    with pytest.raises(PlanError, match="falls off the table in all"):
+        slide(narrow, thing, config=replace(far, rehearsed=True))
 
 
 def test_a_push_as_a_plan(narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPlan], tmp_path: Path) -> None:
