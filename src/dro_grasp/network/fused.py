@@ -4,7 +4,8 @@ Imported only where there is a CUDA device and Triton. Both kernels keep in regi
 hidden layers of pairs, and the values of neighbours. Source: ours.
 """
 
-# pyright: reportMissingImports=false, reportIndexIssue=false
+# pyright: reportMissingImports=false, reportIndexIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false
 from __future__ import annotations
 
 import os
