@@ -256,7 +256,9 @@ def test_stored_grasps_of_each_hand_are_as_many_as_the_table_wants(path: Path) -
 
 
 @pytest.mark.assets
-def test_what_agreement_needs_of_the_assets_goes_to_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_agreement_needs_of_the_assets_goes_to_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, assets_folder: Path
+) -> None:
     monkeypatch.chdir(ROOT)
     names = [name for name, _ in device_trials.shares(GraspBatch.load(device_trials.FILES[0]), 100)]
     expected = [load_object(name) for name in names]
