@@ -4,8 +4,8 @@ Hands and objects are built in. Prediction is of candidates of the network alone
 of one pair, some of many pairs of one hand, and the four of which one grasp is chosen, by stage, with settling and without. The
 first run, which captures graphs, is told apart. Many pairs are of sixteen objects, each of which comes four times as an object
 of its own. Synthesis is the optimiser's descent, without trials; shards are all of it, in one process: what is `strict`-valid
-and confirmed, of training objects that are prepared before. Training is measured by
-`lab.benchmarks.training`, and all of it in a few minutes by `lab.benchmarks.gpu_table`.
+and confirmed, of training objects that are prepared before. Training is measured by `lab.benchmarks.training`, and all of it in
+a few minutes by `lab.benchmarks.gpu_table`.
 
     python -m lab.benchmarks.device [--device cuda] [--only prediction,synthesis,shards] [--settled] [--alone] [--quick]
         [--record FILE] [--json]
