@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -18,14 +20,14 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import gives_way
 from dro_grasp.predict.settling import SettleConfig, physics, settle_all, weigh_settled_all
-from dro_grasp.simulation import rollout as rollout_module, warp_worlds
+from dro_grasp.simulation import rollout as rollout_module, trial as trial_module, warp_worlds
 from dro_grasp.simulation.grasp_state import grasp_state, grasp_state_many
 from dro_grasp.simulation.joint_model import ABSENT, joins, joint_model
-from dro_grasp.simulation.outcome import LOST_DISTANCE
-from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.outcome import LOST_DISTANCE, TrialResult
+from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.rollout import rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-from dro_grasp.simulation.trial import hand_shift, settle, settle_many
+from dro_grasp.simulation.trial import hand_shift, settle, settle_many, simulate, simulate_many
 from dro_grasp.simulation.weighing import WeighingConfig, weigh, weigh_many
 from dro_grasp.simulation.worlds import WARP
 from tests.helpers.loaded_hands import loaded_hand
@@ -124,6 +126,42 @@ def test_closing_states_and_payloads_of_several_objects_are_those_of_each_alone(
         near(squeeze.torque[rows], force.torque, 1e-3)
         near(payload, weigh(HAND, obj, told), 1e-3)
     assert float(payloads[1].max()) > 0
+
+
+@pytest.mark.parametrize("coarse", [None, 0, 2])
+def test_trials_of_several_objects_are_those_of_each_alone(
+    batches: list[GraspBatch], steps: Steps, monkeypatch: pytest.MonkeyPatch, coarse: int | None
+) -> None:
+    """Of one trial each, and of several, some of them with coarse objects; one grasp is too deep for any."""
+    rules = protocol("strict")
+    if coarse is not None:
+        rules = replace(rules, perturbations=Perturbations(
+            trials=4, needed=2, shift=0.003, friction=(0.5, 2.0), mass=(0.5, 2.0), gain=(0.5, 2.0), coarse=coarse))
+    centre = batches[1].T_object_wrist[:1].clone()
+    centre[:, :3, 3] = torch.as_tensor(OBJECTS[1].centre_of_mass).float() - HAND.grasp_centre_wrist
+    many = [batches[0], GraspBatch.concatenate([batches[1], batches[1][:1].replace(T_object_wrist=centre)]), batches[2][:0],
+            batches[2]]
+    objects = [*OBJECTS[:2], OBJECTS[0], OBJECTS[2]]
+    found = simulate_many(HAND, objects, many, rules, device="cuda", confirm=False)
+    assert max(len(joint.scenes) for joint in steps.joints) == len(OBJECTS)
+    alone = [simulate(HAND, obj, grasps, rules, another=True) for obj, grasps in zip(objects, many, strict=True)]
+    for one, other in zip(found, alone, strict=True):
+        assert one.failure == other.failure
+        assert one.contact_links == other.contact_links
+        for name in ("closing_shift", "displacement", "penetration", "robustness"):
+            near(getattr(one, name), getattr(other, name), 1e-3)
+    failures = {failure for one in alone for failure in one.failure}
+    assert failures > {None}
+    lying = [replace(one, success=torch.ones_like(one.success), failure=(None,) * len(one.failure)) for one in found]
+    monkeypatch.setattr(trial_module, "_evaluated", liar(trial_module._evaluated, lying))
+    confirmed = simulate_many(HAND, objects, many, rules, device="cuda")
+    assert [one.failure for one in confirmed] == [one.failure for one in alone]
+
+
+def liar(evaluated: Callable[..., TrialResult], lying: list[TrialResult]) -> Callable[..., TrialResult]:
+    """A device on which everything holds."""
+    return lambda part, rollout, workers: TrialResult.join(lying, "") if rollout.device == "cuda" else evaluated(
+        part, rollout, workers)
 
 
 def test_settling_of_several_objects_is_that_of_each_alone(batches: list[GraspBatch], monkeypatch: pytest.MonkeyPatch) -> None:

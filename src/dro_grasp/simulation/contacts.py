@@ -37,6 +37,11 @@ class Penetration(Rows):
     object: Float[np.ndarray, " n"]  # of hand and object, or how far a finger pierces it [m]; zero without contact
     own: Float[np.ndarray, " n"]  # summed over pairs of hand links, the deepest contact of each pair [m]
 
+    @staticmethod
+    def join(parts: Sequence[Penetration]) -> Penetration:
+        """One after the other."""
+        return Penetration(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("object", "own")))
+
 
 def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
     """Penetration of the collision shapes in the labelled pose, without any step of time."""

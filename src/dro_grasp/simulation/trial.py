@@ -26,7 +26,7 @@ from dro_grasp.simulation.piercing import pierced
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts, rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-from dro_grasp.simulation.worlds import on_processor
+from dro_grasp.simulation.worlds import Share, on_processor
 
 
 @checked
@@ -54,35 +54,49 @@ def simulate(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist, or the extra is missing.
     """
-    scene = scene_of(hand, obj, grasps, protocol)
     if not another:
         grasps.require_object(obj)
-    results, done = [], 0
-    for part, rollout in rollouts(scene, hand, grasps, workers, device=device):
+    result, = simulate_many(
+        hand, [obj], [grasps], protocol, workers=workers, progress=progress, device=device, confirm=confirm)
+    return replace(result, asked=grasps.asked)
+
+
+def simulate_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    workers: int | None = None, progress: Callable[[int, int], None] | None = None, device: str = "cpu", confirm: bool = True,
+) -> list[TrialResult]:
+    """The same for several objects, whoever their grasps were made for, together on a device."""
+    scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
+    label, counts, results, done = scenes[0].protocol.label, [len(grasps) for grasps in batches], list[TrialResult](), 0
+    for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
         result = _evaluated(part, rollout, workers)
         if confirm and not on_processor(rollout.device):
-            result = _confirmed(scene, part, result, workers)
+            result = _confirmed(part, rollout, result, workers)
         results.append(result)
         done += len(part)
         if progress is not None:
-            progress(done, len(grasps))
-    return TrialResult.join(results, scene.protocol.label, grasps.asked)
+            progress(done, sum(counts))
+    whole = TrialResult.join(results, label)
+    return [whole.rows(rows) for rows in torch.arange(sum(counts)).split(counts)]
 
 
 def _evaluated(part: GraspBatch, rollout: Rollout, workers: int | None) -> TrialResult:
     """All trials of the grasps of a rollout."""
-    penetration = measure_penetration(rollout.scene, part)
+    penetration = Penetration.join([measure_penetration(scene, part[rows]) for scene, rows in rollout.parts()])
     result = run_trial(rollout, penetration)
     return result if rollout.scene.protocol.perturbations.trials == 1 else _repeated(
         rollout, part, result, penetration, workers)
 
 
-def _confirmed(scene: TrialScene, grasps: GraspBatch, result: TrialResult, workers: int | None) -> TrialResult:
+def _confirmed(grasps: GraspBatch, rollout: Rollout, result: TrialResult, workers: int | None) -> TrialResult:
     """The outcome in which the processor has judged what holds."""
-    held, others = result.success.nonzero()[:, 0], (~result.success).nonzero()[:, 0]
-    again = [_evaluated(part, rollout, workers) for part, rollout in rollouts(scene, scene.hand, grasps[held], workers)]
-    joined = TrialResult.join([result.rows(others), *again], result.protocol)
-    return joined.rows(torch.cat([others, held]).argsort())
+    judged = []
+    for scene, rows in rollout.parts():
+        own, found = grasps[rows], result.rows(torch.arange(rows.start, rows.stop))
+        held, others = found.success.nonzero()[:, 0], (~found.success).nonzero()[:, 0]
+        again = [_evaluated(part, other, workers) for part, other in rollouts(scene, scene.hand, own[held], workers)]
+        judged.append(TrialResult.join([found.rows(others), *again], result.protocol).rows(torch.cat([others, held]).argsort()))
+    return TrialResult.join(judged, result.protocol)
 
 
 def record(
@@ -108,16 +122,18 @@ def record(
 
 def run_trial(rollout: Rollout, penetration: Penetration) -> TrialResult:
     """Close the hands of a rollout and push the objects."""
-    scene, rules = rollout.scene, rollout.scene.protocol
+    hand, rules = rollout.scene.hand, rollout.scene.protocol
     closed = rollout.close()
-    contacts = find_contact_links(scene, rollout.qpos)
-    penetration = replace(penetration, object=np.maximum(penetration.object, pierced(scene, rollout.qpos)))
+    contacts = tuple(
+        links for scene, rows in rollout.parts() for links in find_contact_links(scene, rollout.qpos[rows]))
+    through = np.concatenate([pierced(scene, rollout.qpos[rows]) for scene, rows in rollout.parts()])
+    penetration = replace(penetration, object=np.maximum(penetration.object, through))
     shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
     # A trial that has failed already needs no forces.
     failed = ((shift > min(rules.max_closing_shift, LOST_DISTANCE)) | (turn > rules.max_closing_rotation)
               | (penetration.object > rules.max_penetration) | (penetration.own > rules.max_self_penetration))
     displacement, rotation, stable = rollout.push(closed, ~failed)
-    fingers = count_fingers(scene.hand, contacts)
+    fingers = count_fingers(hand, contacts)
     return Measurements(penetration, shift, turn, contacts, fingers, stable, displacement, rotation).judged(rules)
 
 
@@ -125,18 +141,21 @@ def _repeated(
     rollout: Rollout, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
 ) -> TrialResult:
     """The outcome with all trials of a protocol that perturbs, from the first; who penetrates too deep fails them all."""
-    scene, rules = rollout.scene, rollout.scene.protocol.perturbations
+    rules = rollout.scene.protocol.perturbations
     deep = torch.tensor([failure in {Failure.PENETRATION, Failure.SELF_PENETRATION} for failure in first.failure])
     others, rows = deep.nonzero()[:, 0], (~deep).nonzero()[:, 0]
     results = [replace(first.rows(others), robustness=torch.zeros(len(others)))]
     if len(rows):
         conditions, trials = draw(rules, grasps[rows]), [first.rows(rows)]
+        counts = [(scene, int((~deep[part]).sum())) for scene, part in rollout.parts()]
         for begin, end in ((1, rules.trials - rules.coarse), (rules.trials - rules.coarse, rules.trials)):
             if begin == end:
                 continue
             index, own = rows.repeat(end - begin), conditions.rows(slice((begin - 1) * len(rows), (end - 1) * len(rows)))
+            shares = [Share(_scene_of_trial(scene, begin), count) for scene, count in counts if count] * (end - begin)
             other = Rollout(
-                _scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own, device=rollout.device)
+                shares[0].scene, grasps[index], workers or cores(), conditions=own, device=rollout.device,
+                shares=shares if len(counts) > 1 else ())
             trials.append(run_trial(other, penetration.rows(index.numpy())))
         results.append(verdict(TrialResult.join(trials, first.protocol), rules.trials, rules.needed))
     return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
