@@ -6,6 +6,7 @@ what became of it comes back, so worlds that do not step keep theirs. That is a 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields as fields_of, replace
@@ -19,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from dro_grasp.extras import require_extra
+from dro_grasp.geometry.cache import cache_folder
 from dro_grasp.simulation.joint_model import JointModel, joint_model
 from dro_grasp.simulation.worlds import INPUTS, STATE, WARP, Ahead, ProcessorWorlds, Share, Values
 
@@ -32,10 +34,13 @@ CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 
 @dataclass(frozen=True)
 class Room:
-    """Memory for what touches in a world."""
+    """Memory for what touches in a world: as much as the closings of nine in fifteen hands need; others get twice as much.
 
-    contacts: int = 64  # pairs of shapes that are near each other, on average. Ours: 32 of Allegro about a duck
-    rows: int = 128  # constraints, at most. Ours: 46 there, 122 of Shadow about a mug
+    Counts are of lab/studies/contact_room.py.
+    """
+
+    contacts: int = 48  # pairs of shapes that are near each other, on average: 9 to 27 where a hand closes on many objects
+    rows: int = 192  # constraints, at most: 99 % of a hand's closings have no more than 88 to 297
 
     def twice(self, name: str) -> Room:
         """Twice as much of one, up to a limit."""
@@ -252,11 +257,17 @@ def _counted() -> int:
 
 @cache
 def _modules() -> tuple[ModuleType, ModuleType]:
-    """Warp, which tells nothing of what it compiles, and MuJoCo Warp; OptionError: the extra is missing."""
+    """Warp, which tells nothing of what it compiles and keeps it beside derived geometry, and MuJoCo Warp.
+
+    Raises:
+        OptionError: The extra is missing.
+    """
     require_extra("gpu")
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
+    if "WARP_CACHE_PATH" not in os.environ:
+        warp.config.kernel_cache_dir = str(cache_folder() / "warp")
     import mujoco_warp
 
     return warp, mujoco_warp
