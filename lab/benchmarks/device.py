@@ -34,7 +34,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import problems_of
-from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, Wanted, valid_grasps_of_all
 from lab.benchmarks.report import emit, note
 
 HAND, OBJECT = "allegro", "rubber_duck"
@@ -51,7 +51,7 @@ DISTINCT = 16  # Objects of which many pairs are made
 DESCENTS = {"cpu": (128,), "gpu": (1024, 4096)}
 SHARES = {"cpu": (1.0,), "gpu": (1.0, 0.1)}
 """Shares of what passes that the processor judges again; the first shard also compiles."""
-SHARDS = {"cpu": 1, "gpu": 4}
+SHARDS = {"cpu": 1, "gpu": 16}
 """Training objects of which a shard each is made."""
 VALID = "strict"  # Protocol that grasps of a shard pass
 
@@ -147,11 +147,14 @@ def shards(device: str, options: argparse.Namespace) -> list[list[object]]:
     for share in SHARES[kind(device)]:
         config = EngineConfig(protocol=VALID, confirm=share, synthesis=SynthesisConfig(device=device)).suited()
         begin = time.perf_counter()
-        made = [valid_grasps(hand, obj, 0, config)[1] for obj in models]
+        wanted = [Wanted(obj, 0, config.candidates) for obj in models]
+        made = [one for first in range(0, len(wanted), config.together)
+                for _, one in valid_grasps_of_all(hand, wanted[first:first + config.together], config)]
         seconds = time.perf_counter() - begin
-        count, valid, judged = (sum(getattr(one, name) for one in made) for name in ("candidates", "valid", "judged"))
+        count, valid, judged, judging = (
+            sum(getattr(one, name) for one in made) for name in ("candidates", "valid", "judged", "judging_seconds"))
         note(options.record, f"shard, {share:g} confirmed", device=device, rate=valid / seconds, valid=valid, candidates=count,
-             judged=judged, seconds=seconds, objects=[obj.name for obj in models], protocol=VALID)
+             judged=judged, judging=judging / seconds, seconds=seconds, objects=[obj.name for obj in models], protocol=VALID)
         what = f"shards: {len(models)}, {count} candidates, {judged} of {valid} confirmed"
         rows.append(said([what, device, *BLANK, f"{1e3 * seconds / count:.3f}", valid / seconds]))
     return rows

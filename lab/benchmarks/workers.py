@@ -34,7 +34,7 @@ def run(processes: int, shards: int, engine: str) -> list[float]:
     objects = resolve_objects(["builtin:train", f"procedural:0-{processes * shards}"])[: processes * shards]
 
     def pool(job: Job) -> Pool:
-        return RayPool(job, processes, job.config.shard_seconds)
+        return RayPool(job, processes, job.config.limit)
 
     with tempfile.TemporaryDirectory() as folder:
         begin, used = time.perf_counter(), head_seconds(engine)

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from dro_grasp.files import replacing
-from dro_grasp.training.data.engine.pools import Failed, LocalPool
-from dro_grasp.training.data.engine.shards import Shard, Yield
+from dro_grasp.training.data.engine.pools import LocalPool
+from dro_grasp.training.data.engine.shards import Failed, Shard, Yield
 from dro_grasp.training.data.engine.worker import FinishedShard
 
 LIMIT = 3600.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,12 @@ GRASPS = 5
 """Grasps of a shard."""
 
 
-def easy(job: Job, task: Task) -> FinishedShard:
+def easy(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """Five grasps at once; the object `barren` gives none, the hand `broken` an error."""
+    return [_easy(task) for task in tasks]
+
+
+def _easy(task: Task) -> FinishedShard:
     if task.shard.hand == "broken":
         raise HandError("no hand is called 'broken'")
     if task.shard.object == "unsplit":
@@ -28,10 +33,10 @@ def easy(job: Job, task: Task) -> FinishedShard:
     return FinishedShard(task.shard, grasps(count, task.shard.hand, task.shard.object).to_bytes(notes_of(made)), made)
 
 
-def slow(job: Job, task: Task) -> FinishedShard:
+def slow(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """The same after a moment, in which something can be killed."""
     time.sleep(0.2)
-    return easy(job, task)
+    return easy(job, tasks)
 
 
 class Heavy:
@@ -41,24 +46,25 @@ class Heavy:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def dying(job: Job, task: Task) -> FinishedShard:
+def dying(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """The worker dies on `deadly`, always, on `fragile`, the first time, and while it hands over the shard of `heavy`."""
     mark = Path(job.config.protocol) / "died"
-    if task.shard.object == "deadly" or (task.shard.object == "fragile" and not mark.exists()):
+    objects = {task.shard.object for task in tasks}
+    if "deadly" in objects or ("fragile" in objects and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    made = easy(job, task)
-    return replace(made, payload=Heavy()) if task.shard.object == "heavy" else made
+    made = easy(job, tasks)
+    return [replace(one, payload=Heavy()) if one.shard.object == "heavy" else one for one in made]
 
 
-def endless(job: Job, task: Task) -> FinishedShard:
+def endless(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """`endless` never ends, like a mesh that is hard to cut."""
-    if task.shard.object == "endless":
+    if any(task.shard.object == "endless" for task in tasks):
         time.sleep(3600)
-    return easy(job, task)
+    return easy(job, tasks)
 
 
-def telling_threads(job: Job, task: Task) -> FinishedShard:
+def telling_threads(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """Fails with the number of threads that the libraries of this process use."""
     import torch
 

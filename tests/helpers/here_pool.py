@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dro_grasp.training.data.engine.pools import Outcome, Work, failure_of
+from dro_grasp.training.data.engine.pools import Outcome, Work, attempt
 from dro_grasp.training.data.engine.schedule import synthesize_dataset
 from dro_grasp.training.data.engine.worker import Job, Task
 from tests.helpers.engine_work import easy
 
 
 class HerePool:
-    """A pool that does the work in this process, one shard after the other, and remembers the tasks."""
+    """A pool that does the work in this process, one task after the other, and remembers the tasks."""
 
     def __init__(self, job: Job, work: Work = easy) -> None:
         self.job, self.work = job, work
-        self.waiting: list[Task] = []
+        self.waiting: list[list[Task]] = []
         self.tasks: list[Task] = []
         self.closed = False
 
@@ -23,16 +23,13 @@ class HerePool:
     def free(self) -> int:
         return 1 - len(self.waiting)
 
-    def submit(self, task: Task) -> None:
-        self.waiting.append(task)
-        self.tasks.append(task)
+    def submit(self, tasks: list[Task]) -> None:
+        self.waiting.append(tasks)
+        self.tasks += tasks
 
     def wait(self, timeout: float) -> list[Outcome]:
-        task = self.waiting.pop()
-        try:
-            return [(task, self.work(self.job, task))]
-        except Exception as error:
-            return [(task, failure_of(error))]
+        tasks = self.waiting.pop()
+        return [(tasks, attempt(self.work, self.job, tasks))]
 
     def close(self) -> None:
         self.closed = True

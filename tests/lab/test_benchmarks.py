@@ -20,7 +20,6 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict import predictor
 from dro_grasp.predict.config import GraspRequest, RetryConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -33,7 +32,7 @@ from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
 from dro_grasp.training.data.collections.importing import read_foreign
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
-from dro_grasp.training.data.engine.worker import EngineConfig
+from dro_grasp.training.data.engine.worker import EngineConfig, Wanted
 from lab.benchmarks import (
     agreement,
     data_card,
@@ -45,6 +44,7 @@ from lab.benchmarks import (
     returned,
 )
 from lab.benchmarks.report import ROOT, note
+from lab.measurements import STORED
 from lab.studies import directions, matching_rank, paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -226,11 +226,14 @@ def test_synthesis_is_of_strict_valid_grasps_of_built_in_training_objects(
 ) -> None:
     asked, clock = [], iter(range(0, 99, 10))
 
-    def shard(hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig) -> tuple[None, Yield]:
-        asked.append((hand.name, obj.name, obj.split, config.protocol, config.confirm))
-        return None, Yield(candidates=100, valid=10 + len(asked), judged=5)
+    def shards(hand: Hand, wanted: list[Wanted], config: EngineConfig) -> list[tuple[None, Yield]]:
+        made = []
+        for one in wanted:
+            asked.append((hand.name, one.obj.name, one.obj.split, config.protocol, config.confirm))
+            made.append((None, Yield(candidates=100, valid=10 + len(asked), judged=5, judging_seconds=0.5)))
+        return made
 
-    monkeypatch.setattr(device, "valid_grasps", shard)
+    monkeypatch.setattr(device, "valid_grasps_of_all", shards)
     monkeypatch.setattr(device, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     monkeypatch.setattr(device, "SHARDS", {"cpu": 3})
     monkeypatch.setattr(device, "SHARES", {"cpu": (1.0, 0.1)})
@@ -243,9 +246,10 @@ def test_synthesis_is_of_strict_valid_grasps_of_built_in_training_objects(
     found = _noted(tmp_path / "rows.jsonl")
     assert [(found[name]["rate"], found[name]["valid"], found[name]["judged"]) for name in (
         "shard, 1 confirmed", "shard, 0.1 confirmed")] == [(3.6, 36, 15), (4.5, 45, 15)]
+    assert found["shard, 1 confirmed"]["judging"] == 0.15
 
 
-@pytest.mark.parametrize("path", device_trials.FILES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
 def test_stored_grasps_of_each_hand_are_as_many_as_the_table_wants(path: Path) -> None:
     grasps = GraspBatch.load(ROOT / path)
     found = list(device_trials.shares(grasps, 400))
@@ -260,9 +264,9 @@ def test_what_agreement_needs_of_the_assets_goes_to_another_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, assets_folder: Path
 ) -> None:
     monkeypatch.chdir(ROOT)
-    names = [name for name, _ in device_trials.shares(GraspBatch.load(device_trials.FILES[0]), 100)]
+    names = [name for name, _ in device_trials.shares(GraspBatch.load(STORED[0]), 100)]
     expected = [load_object(name) for name in names]
-    device_trials.main(["--grasps", str(device_trials.FILES[0]), "--num", "100", "--pack", str(tmp_path)])
+    device_trials.main(["--grasps", str(STORED[0]), "--num", "100", "--pack", str(tmp_path)])
     monkeypatch.setenv("DRO_GRASP_ASSETS", str(tmp_path))
     assert resolve_objects(["assets:train"]) == sorted(names)
     for one, own in zip(expected, map(load_object, names), strict=True):

@@ -33,7 +33,7 @@ from dro_grasp.simulation.warp_worlds import Room
 from dro_grasp.simulation.weighing import weigh
 from dro_grasp.simulation.worlds import STATE, WARP
 from dro_grasp.training.data.engine import worker
-from dro_grasp.training.data.engine.worker import EngineConfig
+from dro_grasp.training.data.engine.worker import EngineConfig, Wanted
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.fake_device import fake_device
 from tests.helpers.warp_steps import State, Steps
@@ -269,14 +269,15 @@ def test_the_processor_judges_a_share_of_what_a_device_lets_pass_and_all_where_i
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, share: float, seed: int, kept: int, judged: int
 ) -> None:
     config = EngineConfig("carry", confirm=share, synthesis=SynthesisConfig(device="cuda"))
-    valid, refuted, count = worker._judged(hand, obj, grasps.replace(energy=torch.arange(4.0)), config, seed)
+    valid, refuted, count = worker._judged(
+        hand, Wanted(obj, seed, 4), grasps.replace(energy=torch.arange(4.0)), config)
     assert (len(valid), count) == (kept, judged)
     assert sum(refuted.values()) == 4 - kept
     assert torch.equal(valid.energy, torch.arange(float(kept)))
 
 
 def test_without_a_device_nothing_is_judged_twice(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
-    valid, refuted, count = worker._judged(hand, obj, grasps, EngineConfig("carry"), 0)
+    valid, refuted, count = worker._judged(hand, Wanted(obj, 0, 4), grasps, EngineConfig("carry"))
     assert (valid, refuted, count) == (grasps, {}, 0)
 
 
@@ -284,26 +285,28 @@ def test_without_a_device_nothing_is_judged_twice(hand: Hand, obj: ObjectModel, 
 def test_a_shard_made_on_a_device_is_that_of_the_processor(
     steps: Callable[..., Steps], monkeypatch: pytest.MonkeyPatch, resettle: bool, tolerance: float
 ) -> None:
-    """From drawn starts to confirmed grasps, with a strict device for PyTorch and MuJoCo in Warp's place.
+    """From drawn starts to confirmed grasps of two objects, with a strict device for PyTorch and MuJoCo in Warp's place.
 
     Settling has no solver of residual slip on a device, which moves fingers by a hundredth.
     """
-    made, hand, can = steps(), load_hand("gripper3"), load_object("can")
+    made, hand, cube, can = steps(), load_hand("gripper3"), load_object("cube"), load_object("can")
     config = EngineConfig("strict", also=("dro",), candidates=24, resettle=resettle, confirm=0.5, synthesis=SynthesisConfig(
-        steps=60, batch_size=24, at_once=24))
-    expected, known = worker.valid_grasps(hand, can, 1, config)
+        steps=60, batch_size=24, at_once=48))
+    wanted = [Wanted(cube, 0, 24), Wanted(can, 1, 24)]
+    processor = [worker.valid_grasps(hand, one.obj, one.seed, config) for one in wanted]
     assert not made.calls
     for module in (worlds_module, rollout_module, trial_module):
         monkeypatch.setattr(module, "on_processor", lambda device: device == "cpu")
     with fake_device() as device:
         own = replace(config, synthesis=replace(config.synthesis, device=device))
-        found, told = worker.valid_grasps(hand, can, 1, own)
-    assert made.calls
-    assert len(found) == told.valid == known.valid > 1
-    assert told.judged == -(-told.valid // 2)
-    assert known.judged == 0
-    assert told.failures == known.failures
-    torch.testing.assert_close(found.energy, expected.energy, rtol=1e-3, atol=1e-4)
-    for name in ("T_object_wrist", "joints"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0.0, atol=tolerance)
-    assert found.protocol == expected.protocol
+        together = worker.valid_grasps_of_all(hand, wanted, own)
+    assert max(len(joint.scenes) for joint in made.joints) == 2
+    for (found, told), (expected, known) in zip(together, processor, strict=True):
+        assert len(found) == told.valid == known.valid > 1
+        assert told.judged == -(-told.valid // 2)
+        assert known.judged == 0
+        assert told.failures == known.failures
+        torch.testing.assert_close(found.energy, expected.energy, rtol=1e-3, atol=1e-4)
+        for name in ("T_object_wrist", "joints"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0.0, atol=tolerance)
+        assert found.protocol == expected.protocol

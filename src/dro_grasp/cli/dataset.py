@@ -113,7 +113,7 @@ class Synthesize:
     def _ray_pool(self, job: Job) -> Pool:
         from dro_grasp.training.data.engine.pools import RayPool
 
-        return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)
+        return RayPool(job, self.workers, job.config.limit, self.ray_address)
 
 
 @dataclass(frozen=True)

@@ -20,35 +20,15 @@ from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.training.data.engine import schedule
-from dro_grasp.training.data.engine.pools import Outcome, Work
+from dro_grasp.training.data.engine.pools import Work
 from dro_grasp.training.data.engine.schedule import SETTINGS, own_pairs, require_settings, synthesize_dataset
 from dro_grasp.training.data.engine.shards import Shard, find_shards, sole_run
-from dro_grasp.training.data.engine.worker import EngineConfig, Job, Task
+from dro_grasp.training.data.engine.worker import EngineConfig, Job
 from tests.helpers.engine_work import GRASPS, easy, slow
+from tests.helpers.here_pool import HerePool
 
 HANDS, OBJECTS, GOAL = ["a", "b"], ["x", "y", "z"], 3 * GRASPS
 """Pairs, and as many grasps of each as three shards hold."""
-
-
-class HerePool:
-    """A pool that does the work in this process."""
-
-    def __init__(self, job: Job, work: Work) -> None:
-        self.job, self.work, self.task = job, work, []
-
-    @property
-    def free(self) -> int:
-        return 1 - len(self.task)
-
-    def submit(self, task: Task) -> None:
-        self.task.append(task)
-
-    def wait(self, timeout: float) -> list[Outcome]:
-        task = self.task.pop()
-        return [(task, self.work(self.job, task))]
-
-    def close(self) -> None:
-        pass
 
 
 def fill(folder: Path, shard: tuple[int, int] = (1, 1), work: Work = easy) -> schedule.DatasetReport:

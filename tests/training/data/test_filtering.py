@@ -20,12 +20,12 @@ from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import changed
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.trial import simulate, simulate_many
 from dro_grasp.training.data.collections import filtering
 from dro_grasp.training.data.collections.bundling import make_bundle
 from dro_grasp.training.data.collections.collection import PairGrasps, read_collection
 from dro_grasp.training.data.collections.filtering import DUPLICATE, FilterConfig, filter_dataset, passing
-from dro_grasp.training.data.engine import worker
+from dro_grasp.training.data.engine import labels
 from dro_grasp.training.data.engine.labels import RESTLESS
 from dro_grasp.training.data.engine.schedule import require_settings
 from dro_grasp.training.data.engine.shards import Shard, find_shards
@@ -100,15 +100,17 @@ def test_marks_of_an_earlier_closing_stay(lazy):
 def test_closed_fingers_are_not_kept_where_one_link_alone_touches(lazy, monkeypatch):
     trials = []
 
-    def few(hand, obj, grasps, rules, **options):
-        found = simulate(hand, obj, grasps, rules, **options)
-        if trials:  # the first is that of the grasps as they are stored
-            found = replace(found, contact_links=tuple(names[:1] for names in found.contact_links))
-        trials.append(found)
-        return found
+    def stored(*given, **options):
+        trials.append(simulate(*given, **options))
+        return trials[-1]
 
-    for module in (filtering, worker):
-        monkeypatch.setattr(module, "simulate", few)
+    def few(*given, **options):
+        found, = simulate_many(*given, **options)
+        trials.append(replace(found, contact_links=tuple(names[:1] for names in found.contact_links)))
+        return [trials[-1]]
+
+    monkeypatch.setattr(filtering, "simulate", stored)
+    monkeypatch.setattr(labels, "simulate_many", few)
     ((pair, kept),) = kept_of(lazy[:1], "dro", close_fingers=True)
     assert int((trials[1].success & (trials[1].contacts == 1)).sum()) > 1
     assert torch.equal(kept.joints, pair.grasps.joints[trials[0].success])

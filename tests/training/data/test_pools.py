@@ -83,7 +83,7 @@ def test_workers_that_feed_a_device_simulate_on_their_share_of_the_cores(monkeyp
     assert EngineConfig().threads == 1
     work = LocalPool(Job(0, EngineConfig()), 1, PATIENCE, engine_work.telling_threads, threads=5)
     try:
-        work.submit(Task(Shard("a", "x", 0), 1))
+        work.submit([Task(Shard("a", "x", 0), 1)])
         (_, failed), = work.wait(PATIENCE)
     finally:
         work.close()
@@ -102,9 +102,9 @@ def test_an_idle_worker_that_dies_is_replaced():
     work = LocalPool(Job(0, EngineConfig()), 1, 60.0, engine_work.easy)
     try:
         for i in range(3):
-            work.submit(Task(Shard("a", "x", i), 64))
+            work.submit([Task(Shard("a", "x", i), 64)])
             (outcome,) = work.wait(PATIENCE)
-            assert isinstance(outcome[1], FinishedShard)
+            assert isinstance(outcome[1][0], FinishedShard)
             (process,) = (p for p in multiprocessing.active_children() if "pebble" in p.name)
             if i == 0:
                 process.kill()

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OptionError, OutputError
+from dro_grasp.errors import ObjectError, OptionError, OutputError
 from dro_grasp.grasps import grasp_file
 from dro_grasp.grasps.batch import DUPLICATE_DISTANCE, GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -19,9 +19,9 @@ from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import read_collection
 from dro_grasp.training.data.engine import schedule as engine, worker
-from dro_grasp.training.data.engine.schedule import PairState, next_pair, synthesize_dataset
+from dro_grasp.training.data.engine.schedule import PairState, next_pairs, synthesize_dataset
 from dro_grasp.training.data.engine.shards import Shard, Yield, find_shards
-from dro_grasp.training.data.engine.worker import EngineConfig, make_shard, shard_seed, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, make_shards, shard_seed, valid_grasps
 from tests.helpers.engine_work import GRASPS
 from tests.helpers.here_pool import HerePool, run
 from tests.helpers.loaded_hands import loaded_hand
@@ -138,26 +138,70 @@ def test_a_disk_that_refuses_stops_the_run_with_everything_before_it(tmp_path, m
 
 def test_the_next_pair_is_idle_and_has_the_fewest_rounds():
     states = {("a", "x"): PairState(done={0, 1}), ("a", "y"): PairState(done={0}), ("a", "z"): PairState()}
-    assert next_pair(states, {("a", "z")}, 10, EngineConfig()) == ("a", "y")
+    assert next_pairs(states, {("a", "z")}, 10, EngineConfig()) == [("a", "y")]
     states["a", "y"].total = Yield(valid=10)
-    assert next_pair(states, {("a", "z")}, 10, EngineConfig()) == ("a", "x")
+    assert next_pairs(states, {("a", "z")}, 10, EngineConfig()) == [("a", "x")]
 
 
 def test_an_object_that_is_being_prepared_is_left_to_one_worker():
     states = {(hand, obj): PairState() for hand in "ab" for obj in "xy"}
-    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "y")
+    assert next_pairs(states, {("a", "x")}, 10, EngineConfig()) == [("b", "y")]
     states["a", "x"].total = Yield(candidates=64)  # then its parts are in the cache
     states["a", "y"].done = states["b", "y"].done = {0}
-    assert next_pair(states, {("a", "x")}, 10, EngineConfig()) == ("b", "x")
+    assert next_pairs(states, {("a", "x")}, 10, EngineConfig()) == [("b", "x")]
 
 
 def test_a_run_that_ends_early_has_all_hands_and_all_objects():
     states = {(hand, obj): PairState() for hand in "abc" for obj in "vwxyz"}
     for _ in range(5):
-        states[next_pair(states, set(), 10, EngineConfig())].done = {0}
+        states[next_pairs(states, set(), 10, EngineConfig())[0]].done = {0}
     begun = [pair for pair, state in states.items() if state.done]
     assert {hand for hand, _ in begun} == set("abc")
     assert {obj for _, obj in begun} == set("vwxyz")
+
+
+def test_pairs_of_one_hand_are_made_together_and_shards_are_larger_where_few_are_left(tmp_path):
+    config = EngineConfig(candidates=64, min_candidates=64, together=2)
+    (tmp_path / "data").mkdir()
+    report, tasks, _ = run(tmp_path / "data", ["a", "b"], ["x", "y", "z"], 5, config=config)
+    hands, sizes = [task.shard.hand for task in tasks], [task.candidates for task in tasks]
+    assert hands == ["a", "a", "b", "b", "a", "b"]
+    assert len({(task.shard.hand, task.shard.object) for task in tasks}) == 6
+    assert sizes == [64, 64, 64, 64, 128, 128]
+    assert report.shards == 6
+
+
+def test_a_pair_on_which_a_worker_died_is_alone():
+    states = {("a", obj): PairState() for obj in "xyz"}
+    states["a", "x"].crashes = 1
+    config = EngineConfig(together=3)
+    assert next_pairs(states, set(), 10, config) == [("a", "y"), ("a", "z")]
+    assert next_pairs(states, {("a", "y"), ("a", "z")}, 10, config) == [("a", "x")]
+    assert next_pairs({}, set(), 10, config) == []
+
+
+def test_an_error_of_one_costs_those_that_are_made_with_it_nothing(tmp_path, monkeypatch):
+    def load(source, **options):
+        if source == "broken":
+            raise ObjectError("the mesh is broken; repair it")
+        return load_object(source, **options)
+
+    monkeypatch.setattr(worker, "_object", load)
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "together").mkdir()
+    made = [run(tmp_path / name, ["gripper3"], ["can", "broken", "sphere"], 2, make_shards, config=replace(SMALL, together=n))
+            for name, n in (("alone", 1), ("together", 3))]
+    assert all(report.failures == {("gripper3", "broken"): "the mesh is broken; repair it"} for report, *_ in made)
+    alone, together = ({shard: GraspBatch.load(shard.path(tmp_path / name)) for shard in find_shards(tmp_path / name)}
+                       for name in ("alone", "together"))
+    assert len(together) >= 2
+    for shard in [shard for shard in alone if shard.round == 0]:
+        assert torch.equal(alone[shard].joints, together[shard].joints)
+
+
+def test_as_many_as_none_are_not_made_together():
+    with pytest.raises(OptionError, match="together is 0"):
+        EngineConfig(together=0)
 
 
 def test_shards_have_seeds_of_their_own():
@@ -185,7 +229,7 @@ def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
 
 
 def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
-    report, tasks, _ = run(tmp_path, ["barrett"], ["can"], 12, make_shard, config=TINY)
+    report, tasks, _ = run(tmp_path, ["barrett"], ["can"], 12, make_shards, config=TINY)
     assert not report.failures
     (pair,) = read_collection(tmp_path)
     found, made = pair.grasps, pair.made
@@ -212,7 +256,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
 def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
     """In this process, and in two others."""
     found = []
-    for name, workers in (("here", lambda job: HerePool(job, make_shard)), ("there", 2)):
+    for name, workers in (("here", lambda job: HerePool(job, make_shards)), ("there", 2)):
         folder = tmp_path / name
         synthesize_dataset(["gripper3"], ["can", "sphere"], 2, folder, workers, config=SMALL, progress=lambda _: None)
         found.append([GraspBatch.load(shard.path(folder)) for shard in find_shards(folder)])
@@ -273,7 +317,7 @@ def test_a_hand_that_cannot_hold_the_object_is_told_why(tmp_path):
     trimesh.creation.box((0.3, 0.3, 0.3)).export(tmp_path / "house.stl")
     config = replace(SMALL, max_barren_rounds=1)
     (tmp_path / "data").mkdir()
-    report, _, _ = run(tmp_path / "data", ["gripper3"], [str(tmp_path / "house.stl"), "can"], 1, make_shard, config=config)
+    report, _, _ = run(tmp_path / "data", ["gripper3"], [str(tmp_path / "house.stl"), "can"], 1, make_shards, config=config)
     (why,) = report.failures.values()
     assert why.startswith("0 grasps, none in the last 1 rounds: ")
     assert "%" in why
@@ -289,7 +333,7 @@ def test_an_object_that_cannot_be_cut_is_told_in_one_line(tmp_path, monkeypatch)
     torus = trimesh.creation.torus(0.05, 0.015)
     torus.export(tmp_path / "ring.stl")
     (tmp_path / "data").mkdir()
-    report, _, lines = run(tmp_path / "data", ["barrett"], [str(tmp_path / "ring.stl")], 1, make_shard, config=TINY)
+    report, _, lines = run(tmp_path / "data", ["barrett"], [str(tmp_path / "ring.stl")], 1, make_shards, config=TINY)
     why = report.failures["barrett", str(tmp_path / "ring.stl")]
     assert "cut into convex parts: CoACD failed (assertion failed), and V-HACD failed" in why
     assert any("ring.stl: the mesh cannot be cut" in line for line in lines)
@@ -298,7 +342,7 @@ def test_an_object_that_cannot_be_cut_is_told_in_one_line(tmp_path, monkeypatch)
 def test_grasps_of_files_remember_them(tmp_path):
     trimesh.creation.icosphere(radius=0.03).export(tmp_path / "ball.stl")
     (tmp_path / "data").mkdir()
-    run(tmp_path / "data", ["gripper3"], [str(tmp_path / "ball.stl")], 1, make_shard, config=replace(SMALL, scale=1.2))
+    run(tmp_path / "data", ["gripper3"], [str(tmp_path / "ball.stl")], 1, make_shards, config=replace(SMALL, scale=1.2))
     (pair,) = read_collection(tmp_path / "data")
     assert set(pair.grasps.extra["object_file"]) == {str(tmp_path / "ball.stl")}
     assert pair.grasps.extra["object_scale"].unique().tolist() == [pytest.approx(1.2)]

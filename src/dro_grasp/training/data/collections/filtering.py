@@ -31,11 +31,11 @@ from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import PairGrasps, Sources, yield_notes
 from dro_grasp.training.data.collections.merging import file_name
-from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest
-from dro_grasp.training.data.engine.pools import Failed, LocalPool, attempt
+from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest, closed_where_it_holds
+from dro_grasp.training.data.engine.pools import LocalPool, attempt
 from dro_grasp.training.data.engine.schedule import COMMAND, REPORT_EVERY, SETTINGS, agree
-from dro_grasp.training.data.engine.shards import Shard, Yield, find_shards, notes_of, remove_leftovers, sole_run
-from dro_grasp.training.data.engine.worker import FinishedShard, closed_where_it_holds
+from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_shards, notes_of, remove_leftovers, sole_run
+from dro_grasp.training.data.engine.worker import FinishedShard
 
 FILTER = "filter"  # Entry of a file's notes, and value of the setting COMMAND
 ROW = "row"  # Further column, while a pair is filtered: which row of it a grasp was

@@ -1,4 +1,4 @@
-"""Pools, which make shards side by side: what every pool does, processes on this machine, a Ray cluster of any size.
+"""Pools, which work side by side: what every pool does, processes on this machine, a Ray cluster of any size.
 
 Files travel as bytes, so the nodes of a cluster need no shared folder. Hands and objects named by path must lie at that path
 on every node, and every node needs the same version of dro-grasp.
@@ -15,67 +15,53 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pebble import ProcessExpired, ProcessPool
 
-from dro_grasp.errors import ClusterError, DroGraspError, OptionError
+from dro_grasp.errors import ClusterError, OptionError
 from dro_grasp.extras import require_extra
+from dro_grasp.training.data.engine.shards import Failed, failure_of
 from dro_grasp.training.data.engine.threads import use_one_thread
-from dro_grasp.training.data.engine.worker import FinishedShard, Job, Task, make_shard
+from dro_grasp.training.data.engine.worker import Job, make_shards
 
 if TYPE_CHECKING:
     import ray
 
 
-Work = Callable[[Any, Any], FinishedShard]
-"""What makes a shard of the settings that all share, a Job for `make_shard`, and a task, which has a `shard`."""
+Work = Callable[[Any, Any], Any]
+"""What makes something of the settings that all share and of a task: `make_shards` of a Job and tasks of one hand."""
 
 
-@dataclass(frozen=True)
-class Failed:
-    """A shard that could not be made."""
-
-    reason: str  # in one line
-    died: bool = False  # the worker died or was stopped: a new attempt may succeed
-
-
-Outcome = tuple[Any, FinishedShard | Failed]  # The task, and what became of it
+Outcome = tuple[Any, Any]  # The task, and what was made of it, or Failed
 
 
 @runtime_checkable
 class Pool(Protocol):
-    """Something that makes shards side by side."""
+    """Something that works side by side."""
 
     @property
     def free(self) -> int:
-        """Number of shards that it would start at once."""
+        """Number of tasks that it would start at once."""
         ...
 
-    def submit(self, task: Task) -> None:
-        """Start a shard."""
+    def submit(self, task: Any) -> None:
+        """Start a task."""
         ...
 
     def wait(self, timeout: float) -> list[Outcome]:
-        """Shards that ended, as soon as there is one; none after `timeout` [s]."""
+        """Tasks that ended, as soon as there is one; none after `timeout` [s]."""
         ...
 
     def close(self) -> None:
-        """Stop everything; shards in flight are dropped."""
+        """Stop everything; tasks in flight are dropped."""
         ...
 
 
-def failure_of(error: BaseException) -> Failed:
-    """An error of one shard in one line."""
-    reason = str(error) if isinstance(error, DroGraspError) else f"{type(error).__name__}: {error}"
-    return Failed(reason.splitlines()[0][:300] if reason else type(error).__name__)
-
-
-def attempt(work: Work, job: Any, task: Any) -> FinishedShard | Failed:
-    """Make a shard; an error becomes a value, as it must not stop the other shards."""
+def attempt(work: Work, job: Any, task: Any) -> Any:
+    """What is made of a task; an error becomes a value, as it must not stop the others."""
     try:
         return work(job, task)
     except Exception as error:  # a fault of ours too: `failure_of` names it
@@ -83,13 +69,13 @@ def attempt(work: Work, job: Any, task: Any) -> FinishedShard | Failed:
 
 
 class LocalPool:
-    """Processes on this machine. A worker's death costs the shard it was making, no other.
+    """Processes on this machine. A worker's death costs what it was making, nothing else.
 
     Each process has a pebble pool of its own. Processes of one pool share a lock, and one that is killed while it hands
     over its shard would keep the lock from the others.
     """
 
-    def __init__(self, job: Any, workers: int, limit: float, work: Work = make_shard, threads: int = 1) -> None:
+    def __init__(self, job: Any, workers: int, limit: float, work: Work = make_shards, threads: int = 1) -> None:
         """Prepare the processes; each starts with its first shard. One that takes longer than the limit [s] is stopped.
 
         Simulations take so many threads in each.
@@ -97,7 +83,7 @@ class LocalPool:
         self.job, self.limit, self.work = job, limit, work
         self.begin = partial(use_one_thread, threads)
         self.idle = [_one_process(self.begin) for _ in range(workers)]
-        self.busy: dict[Future[FinishedShard | Failed], tuple[Any, ProcessPool]] = {}
+        self.busy: dict[Future[Any], tuple[Any, ProcessPool]] = {}
 
     @property
     def free(self) -> int:
@@ -125,7 +111,7 @@ class LocalPool:
         with ThreadPoolExecutor(len(pools)) as threads:
             list(threads.map(_end, pools))
 
-    def _collect(self, future: Future[FinishedShard | Failed]) -> Outcome:
+    def _collect(self, future: Future[Any]) -> Outcome:
         task, pool = self.busy.pop(future)
         try:
             result = future.result()
@@ -169,7 +155,7 @@ class RayPool:
     dies. A cluster that this process has joined already is used from here.
     """
 
-    def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
+    def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shards) -> None:
         """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
 
         `address` is that of the cluster's head, `host:port`, or `auto` for the one that runs here; without it RAY_ADDRESS
@@ -193,7 +179,7 @@ class RayPool:
         """Shards that the cluster makes at once now, less those in flight; at least one may wait for a node."""
         return self._ask(_free)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Any) -> None:
         """Hand a shard to the cluster."""
         self._ask(_submit, task)
 
@@ -252,7 +238,7 @@ class RayTasks:
         _, options["num_cpus"] = shards_at_once(ray.cluster_resources(), self.on_device)
         # Errors come back as values, so Ray retries lost machines and nothing else.
         self.start = ray.remote(**options)(attempt)
-        self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
+        self.running: dict[ray.ObjectRef, tuple[Any, float]] = {}
 
     @staticmethod
     def here() -> RayTasks:
@@ -312,7 +298,7 @@ def shards_at_once(resources: Mapping[str, float], on_device: bool) -> tuple[int
     return count, cpus // count
 
 
-def _submit(task: Task) -> None:
+def _submit(task: Any) -> None:
     tasks = RayTasks.here()
     tasks.running[tasks.start.remote(tasks.work, tasks.job, task)] = (task, time.monotonic())
 

@@ -5,6 +5,7 @@ Killing a run at any time loses at most the shards in flight; a rerun makes only
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import json
 import math
@@ -26,9 +27,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import checked, flat
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
-from dro_grasp.training.data.engine.pools import Failed, LocalPool, Outcome, Pool
-from dro_grasp.training.data.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
-from dro_grasp.training.data.engine.worker import EngineConfig, Job, Task
+from dro_grasp.training.data.engine.pools import LocalPool, Outcome, Pool
+from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
+from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
 
 REPORT_EVERY = 10.0  # Time between lines of progress [s]. Ours
 CANDIDATE_STEP = 64  # Shards have a multiple of this many candidates. Ours
@@ -125,7 +126,7 @@ def synthesize_dataset(
         resume(folder, states, grasps_per_pair, say)
         before, started = sum(s.grasps for s in states.values()), time.perf_counter()
         pool = workers(job) if not isinstance(workers, int) else LocalPool(
-            job, workers, config.shard_seconds, threads=simulating_threads(workers, config))
+            job, workers, config.limit, threads=simulating_threads(workers, config))
         end = math.inf if config.seconds is None else started + config.seconds
         shards = Production(pool, folder, states, grasps_per_pair, config, say, end).finish()
     total = sum(s.grasps for s in states.values())
@@ -197,11 +198,11 @@ def _readable(
     return found
 
 
-def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
-    """The unfinished, idle pair with the fewest rounds, of hands and objects that have had few, or None.
+def next_pairs(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> list[Pair]:
+    """The unfinished, idle pairs of one hand that are made next, together: those with the fewest rounds.
 
-    Pairs on which a worker died come last. So hands take turns, and objects, and a run that ends early has grasps of all of
-    them.
+    The first is of a hand and an object that have had few. So hands take turns, and objects, and a run that ends early has
+    grasps of all of them. Pairs on which a worker died come last, alone.
     """
     # New objects are spread over the workers, as preparing one can take minutes.
     open_pairs = [pair for pair, s in states.items()
@@ -211,8 +212,16 @@ def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config:
     for pair, state in states.items():
         for name in pair:
             turns[name] += len(state.done)
-    return min(open_pairs, default=None, key=lambda pair: (
-        states[pair].crashes, pair[1] in prepared_now, len(states[pair].done), turns[pair[0]], turns[pair[1]]))
+
+    def order(pair: Pair) -> tuple[float, ...]:
+        state = states[pair]
+        return state.crashes, pair[1] in prepared_now, len(state.done), turns[pair[0]], turns[pair[1]]
+
+    first = min(open_pairs, default=None, key=order)
+    if first is None or states[first].crashes:
+        return [] if first is None else [first]
+    fellows = [pair for pair in open_pairs if pair[0] == first[0] and not states[pair].crashes]
+    return heapq.nsmallest(config.together, fellows, key=order)
 
 
 @dataclass
@@ -247,31 +256,39 @@ class Production:
     def _fill(self) -> bool:
         """Start shards while there is room; false when none is left and none in flight."""
         while self.pool.free > 0 and time.perf_counter() < self.end:
-            pair = next_pair(self.states, self.busy, self.goal, self.config)
-            if pair is None:
+            pairs = next_pairs(self.states, self.busy, self.goal, self.config)
+            if not pairs:
                 break
-            state = self.states[pair]
-            earlier = tuple(Shard(*pair, i).path(self.folder).read_bytes() for i in sorted(state.done))
-            missing = next(i for i in itertools.count() if i not in state.done)
-            self.pool.submit(Task(Shard(*pair, missing), state.next_candidates(self.goal, self.config), earlier))
-            self.busy.add(pair)
+            self.pool.submit([self._task(pair, self.config.together // len(pairs)) for pair in pairs])
+            self.busy.update(pairs)
         return bool(self.busy)
 
+    def _task(self, pair: Pair, times: int) -> Task:
+        """A pair's next shard, so many times as large as it would be among others."""
+        state = self.states[pair]
+        earlier = tuple(Shard(*pair, i).path(self.folder).read_bytes() for i in sorted(state.done))
+        missing = next(i for i in itertools.count() if i not in state.done)
+        return Task(Shard(*pair, missing), times * state.next_candidates(self.goal, self.config), earlier)
+
     def _collect(self, outcome: Outcome) -> None:
-        """Store a shard, or note why there is none; one that cannot be stored ends the run, as no other could be."""
-        task, result = outcome
+        """Store shards, or note why there are none; one that cannot be stored ends the run, as no other could be."""
+        tasks, made = outcome
+        for task, own in zip(tasks, itertools.repeat(made) if isinstance(made, Failed) else made, strict=False):
+            self._note(task, own)
+
+    def _note(self, task: Task, made: FinishedShard | Failed) -> None:
         pair = (task.shard.hand, task.shard.object)
         state = self.states[pair]
         self.busy.discard(pair)
-        if not isinstance(result, Failed):
-            task.shard.save(result.payload, self.folder)
-            state.note(task.shard, result.result)
+        if not isinstance(made, Failed):
+            task.shard.save(made.payload, self.folder)
+            state.note(task.shard, made.result)
             state.crashes = 0
             self.shards += 1
             return
-        state.crashes += result.died
-        if not result.died or state.crashes >= self.config.max_crashes:
-            state.error = result.reason + (f", {state.crashes} times" if result.died else "")
+        state.crashes += made.died
+        if not made.died or state.crashes >= self.config.max_crashes:
+            state.error = made.reason + (f", {state.crashes} times" if made.died else "")
             self.say(f"{pair[0]} on {pair[1]}: {state.error}")
 
     def _summary(self, seconds: float) -> str:
@@ -287,7 +304,7 @@ COMMAND = "command"  # Setting that says which command fills the folder
 SYNTHESIZE = "synthesize"  # Its value where it is not noted
 FREE = frozenset({
     "seconds", "candidates", "min_candidates", "max_candidates", "max_barren_rounds", "candidate_budget", "max_crashes",
-    "shard", "shard_seconds", "synthesis.device"})
+    "shard", "shard_seconds", "together", "synthesis.device"})
 """Settings that a rerun may change: how long it goes on, where, in how large shards, and when it gives up a pair."""
 
 

@@ -21,7 +21,7 @@ from urllib.parse import quote, unquote
 from filelock import FileLock, Timeout
 
 from dro_grasp._version import __version__
-from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.errors import DroGraspError, GraspFileError, OutputError
 from dro_grasp.files import make_folder, replacing
 from dro_grasp.grasps.grasp_file import read_footer
 
@@ -48,6 +48,7 @@ class Yield:
     duplicates: int = 0  # passed, but near-duplicates of an earlier grasp
     valid: int = 0  # passed and stored
     judged: int = 0  # of what passed on a device, tried again by the processor; what it refutes is among the failures
+    judging_seconds: float = 0.0  # how long the processor took for that [s]
     cpu_seconds: float = 0.0  # CPU time without loading hand and object [s]
     preparation_seconds: float = 0.0
     """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""
@@ -116,6 +117,20 @@ class Shard:
         except OutputError as error:
             raise OutputError(f"{error}. The shards that are there are whole; in the same folder, the same command goes on "
                               "from them") from error
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A shard that could not be made."""
+
+    reason: str  # in one line
+    died: bool = False  # the worker died or was stopped: a new attempt may succeed
+
+
+def failure_of(error: BaseException) -> Failed:
+    """An error of one shard in one line."""
+    reason = str(error) if isinstance(error, DroGraspError) else f"{type(error).__name__}: {error}"
+    return Failed(reason.splitlines()[0][:300] if reason else type(error).__name__)
 
 
 def notes_of(result: Yield) -> dict[str, Any]:

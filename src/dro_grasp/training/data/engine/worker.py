@@ -1,4 +1,7 @@
-"""The work of one shard: synthesize candidates, close the hand on the object, keep those that pass the trial."""
+"""The work of shards: synthesize candidates, close the hand on the object, keep those that pass the trial.
+
+On a device, which takes as long for few, those of several objects of a hand are made together.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,39 @@ import io
 import math
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 
 from dro_grasp.devices import on_accelerator
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch, distinct
-from dro_grasp.grasps.columns import DEPTH, RELABELLED
+from dro_grasp.grasps.columns import DEPTH
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimize.fingers import close_idle_fingers
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
-from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol
-from dro_grasp.simulation.trial import hand_shift, settle, simulate
+from dro_grasp.optimize.grasp_energy import GraspEnergy
+from dro_grasp.optimize.synthesis import Lot, SynthesisConfig, synthesize_all
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
+from dro_grasp.simulation.trial import hand_shift, settle_many, simulate_many
 from dro_grasp.training.data.bundle.training_file import split_of
-from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest
-from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
+from dro_grasp.training.data.engine.labels import (
+    FEWEST_LINKS,
+    RESTLESS,
+    also_passing_of_all,
+    at_rest_of_all,
+    closed_where_they_hold,
+)
+from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, failure_of, notes_of
 
-ON_DEVICE = {"candidates": 2048, "min_candidates": 1024, "max_candidates": 4096, "candidate_budget": 65536}
-"""Sizes of shards whose candidates are made on a device, which takes as long for few (ours)."""
+ON_DEVICE = {"candidates": 512, "min_candidates": 256, "max_candidates": 1024, "candidate_budget": 65536, "together": 8}
+"""Sizes of shards whose candidates are made on a device, which takes as long for few: 4,096 of a hand at once (ours)."""
 AGREEMENT = 0.9
 """Share of a device's passes that the processor must agree with; with less, it judges them all (ours: 98 % was measured)."""
 LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
@@ -63,8 +73,8 @@ class EngineConfig(Checked):
     """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
     max_shift: float = 0.03
     """Candidates that closing moves farther relative to the object get no trial [m]."""
-    min_contact_links: int = 2
-    """Links that must touch the object after closing; with fewer, a success is a cage or luck (ours)."""
+    min_contact_links: int = FEWEST_LINKS
+    """Links that must touch the object after closing."""
     close_fingers: bool = True
     """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
     also: tuple[str, ...] = ()
@@ -80,11 +90,14 @@ class EngineConfig(Checked):
     shard: tuple[int, int] = (1, 1)
     """Which part of the pairs this run fills, and of how many: (3, 16) is the third of sixteen, as `--shard 3/16`. Runs of all
     parts may fill one folder at the same time, and together make the same grasps as one run."""
+    together: int = 1
+    """Objects of a hand whose shards are made together. Where fewer are left, shards are larger, as many times."""
     confirm: float = 1.0
     """Share of what passes on a device that the processor judges again; the device's verdict stands for the rest, unless the
     processor lets less than AGREEMENT of the share pass."""
     shard_seconds: float = 1800.0
-    """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object."""
+    """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object. Shards that are
+    made together may take as many times as long."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The optimiser."""
 
@@ -92,6 +105,9 @@ class EngineConfig(Checked):
         super().__post_init__()
         if not 1 <= self.shard[0] <= self.shard[1]:
             raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
+        if self.together < 1:
+            raise OptionError(f"together is {self.together}; give how many objects of a hand are worked on together, at "
+                              "least 1")
         if not 0 < self.confirm <= 1:
             raise OptionError(f"confirm is {self.confirm}; give the share that the processor judges again, above 0 and up to 1")
 
@@ -99,6 +115,11 @@ class EngineConfig(Checked):
     def threads(self) -> int | None:
         """Threads of simulations: one; all that this process may use where a device makes the candidates."""
         return None if on_accelerator(self.synthesis.device) else 1
+
+    @property
+    def limit(self) -> float:
+        """Longest time for what is made together [s]."""
+        return self.shard_seconds * self.together
 
     def suited(self) -> EngineConfig:
         """With shards as large as suits the device."""
@@ -141,20 +162,48 @@ _hand = lru_cache(maxsize=16)(load_hand)
 _object = lru_cache(maxsize=16)(load_object)
 
 
-def make_shard(job: Job, task: Task) -> FinishedShard:
-    """Make one shard. Files come and go as bytes, so that it runs on machines without the folder."""
-    started = time.process_time()
-    hand, obj = _hand(task.shard.hand), _object(task.shard.object, scale=job.config.scale)
-    _ = obj.distance_field, obj.parts
+def make_shards(job: Job, tasks: Sequence[Task]) -> list[FinishedShard | Failed]:
+    """Make shards of one hand. Files come and go as bytes, so that it runs on machines without the folder.
+
+    What fails is made again alone, so that its error costs the others nothing.
+    """
+    try:
+        return [*_made(job, tasks)]
+    except Exception as error:  # a fault of ours too: `failure_of` names it
+        if len(tasks) == 1:
+            return [failure_of(error)]
+        return [done for task in tasks for done in make_shards(job, [task])]
+
+
+def _made(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
+    """The same together; the time that they take counts for each in equal parts."""
+    started, config = time.process_time(), job.config
+    hand, wanted = _hand(tasks[0].shard.hand), []
+    for task in tasks:
+        obj = _object(task.shard.object, scale=config.scale)
+        _ = obj.distance_field, obj.parts
+        earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
+        wanted.append(Wanted(
+            obj, shard_seed(job.seed, task.shard), task.candidates, GraspBatch.concatenate(earlier) if earlier else None))
     prepared = time.process_time()
-    earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
-    grasps, result = valid_grasps(
-        hand, obj, shard_seed(job.seed, task.shard), job.config, task.candidates,
-        GraspBatch.concatenate(earlier) if earlier else None)
-    grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.config.scale)
-    grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
-    result = dataclasses.replace(result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started)
-    return FinishedShard(task.shard, grasps.to_bytes(notes_of(result)), result)
+    made = valid_grasps_of_all(hand, wanted, config)
+    preparation, spent = (prepared - started) / len(tasks), (time.process_time() - prepared) / len(tasks)
+    done = []
+    for task, (grasps, result) in zip(tasks, made, strict=True):
+        grasps = with_sources(grasps, task.shard.hand, task.shard.object, config.scale)
+        grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
+        result = dataclasses.replace(result, cpu_seconds=spent, preparation_seconds=preparation)
+        done.append(FinishedShard(task.shard, grasps.to_bytes(notes_of(result)), result))
+    return done
+
+
+class Wanted(NamedTuple):
+    """Grasps that are wanted of an object."""
+
+    obj: ObjectModel
+    seed: int
+    candidates: int
+    earlier: GraspBatch | None = None  # A grasp close to one of these is a duplicate
 
 
 def valid_grasps(
@@ -162,87 +211,95 @@ def valid_grasps(
     earlier: GraspBatch | None = None,
 ) -> tuple[GraspBatch, Yield]:
     """Candidates of one seed that pass the protocol, best energy first, without near-duplicates of them and of earlier ones."""
-    count = candidates or config.candidates
-    drawn = synthesize(hand, obj, count, seed, config.synthesis)
-    ranked = drawn[0 : max(1, round(config.trial_share * count))]
-    grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
-    made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
-    if config.settle and not config.resettle and len(grasps):
-        closed = settle(hand, obj, grasps, config.protocol, workers=config.threads, device=config.synthesis.device)
-        shift = hand_shift(hand, grasps, closed)
-        made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
-        grasps = closed[shift < config.max_shift]
-    passed, failures = _passing(hand, obj, grasps, config)
-    new = distinct(hand, passed, earlier=earlier)
-    valid, refuted, judged = _judged(hand, obj, passed[new], config, seed)
-    return valid, dataclasses.replace(
-        made, failures=dict(failures + refuted), duplicates=int((~new).sum()), judged=judged, valid=len(valid))
+    return valid_grasps_of_all(hand, [Wanted(obj, seed, candidates or config.candidates, earlier)], config)[0]
+
+
+def valid_grasps_of_all(hand: Hand, wanted: Sequence[Wanted], config: EngineConfig) -> list[tuple[GraspBatch, Yield]]:
+    """The same for several objects, together where a device makes the candidates."""
+    objects, (batches, made) = [one.obj for one in wanted], _drawn(hand, wanted, config)
+    if config.settle and not config.resettle:
+        batches, made = _closed(hand, objects, batches, made, config)
+    found = []
+    passed = _passing(hand, objects, batches, config)
+    for one, result, (kept, failures) in zip(wanted, made, passed, strict=True):
+        new = distinct(hand, kept, earlier=one.earlier)
+        begin = time.perf_counter()
+        valid, refuted, judged = _judged(hand, one, kept[new], config)
+        found.append((valid, dataclasses.replace(
+            result, failures=dict(failures + refuted), duplicates=int((~new).sum()), judged=judged, valid=len(valid),
+            judging_seconds=time.perf_counter() - begin if judged else 0.0)))
+    return found
+
+
+def _drawn(
+    hand: Hand, wanted: Sequence[Wanted], config: EngineConfig
+) -> tuple[list[GraspBatch], list[Yield]]:
+    """Candidates that get a trial."""
+    own = config.synthesis
+    energies = [GraspEnergy.of_object(hand, one.obj, own.energy, own.contacts, own.device) for one in wanted]
+    lots = [Lot(energy, one.obj, one.candidates, one.seed, own) for energy, one in zip(energies, wanted, strict=True)]
+    batches, made = [], []
+    for one, drawn in zip(wanted, synthesize_all(lots), strict=True):
+        ranked = drawn[0 : max(1, round(config.trial_share * one.candidates))]
+        batches.append(ranked[ranked.extra[DEPTH] < config.max_penetration])
+        made.append(Yield(
+            candidates=one.candidates, ranked_out=one.candidates - len(ranked), deep=len(ranked) - len(batches[-1])))
+    return batches, made
+
+
+def _closed(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], made: Sequence[Yield], config: EngineConfig
+) -> tuple[list[GraspBatch], list[Yield]]:
+    """Candidates where closing leaves them, without those that it moves too far."""
+    closed = settle_many(
+        hand, objects, batches, config.protocol, workers=config.threads, device=config.synthesis.device)
+    near = [hand_shift(hand, *each) < config.max_shift for each in zip(batches, closed, strict=True)]
+    return ([own[rows] for own, rows in zip(closed, near, strict=True)],
+            [dataclasses.replace(own, moved=int((~rows).sum())) for own, rows in zip(made, near, strict=True)])
 
 
 def _passing(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig
-) -> tuple[GraspBatch, Counter[str]]:
-    """The grasps that pass all protocols with enough contact where candidates are made, and why the others fail."""
-    restless, device = 0, config.synthesis.device
-    if config.resettle and len(grasps):
-        grasps, stable = at_rest(hand, obj, grasps, config.close_fingers, device)
-        restless, grasps = int((~stable).sum()), grasps[stable]
-    passed, failures = _tried(hand, obj, grasps, config, device, config.close_fingers and not config.resettle)
-    return passed, failures + Counter({RESTLESS: restless})
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], config: EngineConfig
+) -> list[tuple[GraspBatch, Counter[str]]]:
+    """The grasps of each object that pass all protocols with enough contact where candidates are made, and why others fail."""
+    device = config.synthesis.device
+    if not config.resettle:
+        return _tried(hand, objects, batches, config, device, config.close_fingers)
+    rested = at_rest_of_all(hand, objects, batches, config.close_fingers, device)
+    tried = _tried(hand, objects, [grasps[stable] for grasps, stable in rested], config, device)
+    return [(passed, failures + Counter({RESTLESS: int((~stable).sum())}))
+            for (passed, failures), (_, stable) in zip(tried, rested, strict=True)]
 
 
 def _tried(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: EngineConfig, device: str, close_fingers: bool = False
-) -> tuple[GraspBatch, Counter[str]]:
-    """The grasps that pass trials on a device with enough contact, and why the others fail; idle fingers may close between."""
-    trial = simulate(hand, obj, grasps, config.protocol, workers=config.threads, device=device, confirm=False)
-    loose = trial.success & (trial.contacts < config.min_contact_links)
-    passed = grasps.with_trial(trial)[trial.success & ~loose]
-    if close_fingers and len(passed):
-        passed = closed_where_it_holds(
-            hand, obj, passed, config.protocol, config.min_contact_links, config.threads, device)
-    failures = Counter(failure.value for failure in trial.failure if failure)
-    passed, later = also_passing(hand, obj, passed, [protocol(name) for name in config.also], config.threads, device)
-    return passed, failures + Counter({LOOSE: int(loose.sum())}) + later
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], config: EngineConfig, device: str,
+    close_fingers: bool = False,
+) -> list[tuple[GraspBatch, Counter[str]]]:
+    """The grasps that pass trials on a device with enough contact, and why others fail; idle fingers may close between."""
+    trials = simulate_many(
+        hand, objects, batches, config.protocol, workers=config.threads, device=device, confirm=False)
+    passed, failures = [], []
+    for grasps, trial in zip(batches, trials, strict=True):
+        loose = trial.success & (trial.contacts < config.min_contact_links)
+        passed.append(grasps.with_trial(trial)[trial.success & ~loose])
+        failures.append(Counter(failure.value for failure in trial.failure if failure) + Counter({LOOSE: int(loose.sum())}))
+    if close_fingers:
+        passed = closed_where_they_hold(
+            hand, objects, passed, config.protocol, config.min_contact_links, config.threads, device)
+    later = also_passing_of_all(hand, objects, passed, [protocol(name) for name in config.also], config.threads, device)
+    return [(kept, first + more) for first, (kept, more) in zip(failures, later, strict=True)]
 
 
-def _judged(
-    hand: Hand, obj: ObjectModel, valid: GraspBatch, config: EngineConfig, seed: int
-) -> tuple[GraspBatch, Counter[str], int]:
+def _judged(hand: Hand, one: Wanted, valid: GraspBatch, config: EngineConfig) -> tuple[GraspBatch, Counter[str], int]:
     """Valid grasps without those that the processor refutes, why it does, and how many it judged: a share drawn at random."""
     if not on_accelerator(config.synthesis.device) or not len(valid):
         return valid, Counter(), 0
-    order = torch.randperm(len(valid), generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(len(valid), generator=torch.Generator().manual_seed(one.seed))
     count = math.ceil(config.confirm * len(valid))
-    held, refuted = _tried(hand, obj, valid[order[:count]], config, "cpu")
+    (held, refuted), = _tried(hand, [one.obj], [valid[order[:count]]], config, "cpu")
     others = valid[order[count:]]
     if len(held) < AGREEMENT * count:
-        others, more = _tried(hand, obj, others, config, "cpu")
+        (others, more), = _tried(hand, [one.obj], [others], config, "cpu")
         refuted, count = refuted + more, len(valid)
     kept = GraspBatch.concatenate([held, others])
     return kept[kept.energy.argsort(stable=True)], refuted, count
-
-
-def closed_where_it_holds(
-    hand: Hand, obj: ObjectModel, evaluated: GraspBatch, protocol: str | Protocol,
-    min_links: int = EngineConfig.min_contact_links, workers: int | None = None, device: str = "cpu",
-) -> GraspBatch:
-    """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
-
-    Column `relabelled` marks them. A device's verdict is not confirmed here. Energies stay those by which grasps were chosen.
-    """
-    known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
-    relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
-    energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points), device=device)
-    closed = close_idle_fingers(energy, evaluated).replace(energy=evaluated.energy, extra=evaluated.extra)
-    rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
-    if not len(rows):
-        return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
-    trial = simulate(hand, obj, closed[rows], protocol, workers=workers, device=device, confirm=False)
-    better = trial.success & (trial.contacts >= min_links)
-    better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
-    order = torch.arange(len(evaluated))
-    order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
-    chosen = GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
-    relabelled = relabelled | (order >= len(evaluated))
-    return chosen.replace(extra=chosen.extra | {RELABELLED: relabelled})
