@@ -9,6 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from lab.published_hands import HANDS as PUBLISHED
 
@@ -39,6 +40,8 @@ TEST_OBJECTS = ("camera", "chess_pawn", "lemon", "mug", "rubber_duck", "screwdri
 """Those of `builtin:test`, one a command."""
 TABLES = 6
 """Tables that each robot clears."""
+STORED = tuple(Path("data/grasps") / f"{name}.parquet" for name in ("allegro", "barrett", "shadowhand"))
+"""Stored grasps that a device judges as well."""
 SEEN_IN_PART = "seen in part"  # End of the names of cells of one depth image
 FAST, ALL = "carry dexgraspbench strict", "carry robust dexgraspbench strict"
 """Protocols: those of one trial a grasp, and with the one of eight. Beside the paper stands its own as well: `dro`."""
@@ -200,6 +203,12 @@ MEASUREMENTS = {
             ("commands", "--runs 3 "), ("inference", ""), ("returned", ""), ("joint_solver", ""), ("kernel", ""),
             ("trials", "--protocol carry "), ("synthesis", "--protocol carry "))},
         wings=("compare", "training", "cli"), alone=True),
+    "agreement": Measurement("Verdicts of MuJoCo Warp, on the processor, beside MuJoCo's", {
+        path.stem: "python -m lab.benchmarks.device_trials --device warp --worlds --settled 0 --protocols strict "
+        f"--grasps {path} --json" for path in STORED}),
+    "scaling": Measurement("Weak scaling of the data engine", {
+        engine: f"python -m lab.benchmarks.workers --engine {engine} --json" for engine in ("local", "ray")},
+        wings=("training",), alone=True),
     "gpu": Measurement("Times on a GPU", {
         "table": "python -m lab.benchmarks.gpu_table --json"}, wings=("training",), alone=True, device="cuda"),
 }

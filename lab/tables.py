@@ -243,6 +243,14 @@ def parts(results: Results) -> str:
     ])
 
 
+def scaling(results: Results) -> str:
+    """As many shards for each process, however many there are."""
+    columns = ("processes", "shards", "time [s]", "efficiency", "CPU of the head [ms a shard]", "bytes a shard")
+    return table(("processes of", *columns), [
+        [engine, *(f"{row[name]:.3g}" for name in columns)]
+        for engine in ("local", "ray") for row in results.cell("scaling", engine)["rows"]])
+
+
 def again(results: Results) -> str:
     """Stored grasps that pass their protocol again."""
     rows = results.cell("data", "again")["again"]
@@ -311,6 +319,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "speed.commands": commands,
     "speed.parts": parts,
     "data.again": again,
+    "data.scaling": scaling,
     "targets.all": targets.all_targets,
 }
 """Tables by name."""

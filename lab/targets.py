@@ -17,7 +17,7 @@ from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import Row, average
 from lab.benchmarks import gpu_table
 from lab.benchmarks.report import ROOT
-from lab.measurements import FLAT_THINGS, PAPER_HANDS, ROBOTS
+from lab.measurements import FLAT_THINGS, PAPER_HANDS, ROBOTS, STORED
 from lab.reading import MissingResult, Results, as_row, mixed, percent, plain, select, table
 from lab.robot_tables import HOLD_NOISES, LIFTED, attempts, hold_rows
 
@@ -194,6 +194,12 @@ def on_gpu(results: Results, row: gpu_table.Row) -> Found:
     return Found(value, f"{value:,.4g}")
 
 
+def agreeing(results: Results, hand: str) -> Found:
+    """Stored grasps whose trial ends as on MuJoCo."""
+    row, = results.cell("agreement", hand)["rows"]
+    return counted(row["same"], row["grasps"])
+
+
 RIGHT = ("accepted", "fingers", "thumb", "side", "palm", "open")
 """What of a published hand is judged from pictures."""
 
@@ -202,6 +208,9 @@ def targets() -> Iterator[Target]:
     """All of them, by subject."""
     yield Target("hands", "published hands accepted as they are, of 24", 23, partial(published, columns=("accepted",)), unit="")
     yield Target("hands", "right by pictures, of these", 22, partial(published, columns=RIGHT), unit="")
+    for path in STORED:
+        yield Target(
+            "Warp on the processor", f"verdicts of MuJoCo, `strict`, {path.stem}", 97, partial(agreeing, hand=path.stem))
     for row in gpu_table.ROWS:
         yield Target("GPU", row.what, row.goal, partial(on_gpu, row=row), not row.fewer, row.unit)
     yield Target("two cores", "one of sixteen grasps with its candidates", 80,

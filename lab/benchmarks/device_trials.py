@@ -44,8 +44,8 @@ from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import TrialResult, simulate
 from lab.benchmarks.agreement import kappa
 from lab.benchmarks.report import emit, note, rate
+from lab.measurements import STORED
 
-FILES = tuple(Path("data/grasps") / f"{name}.parquet" for name in ("allegro", "barrett", "shadowhand"))
 DIFFERENT = 64
 """Grasps that are repeated until they fill the worlds."""
 COLUMNS = ("what", "grasps", "held on the processor [%]", "held on the device [%]", "same", "same [%]", "kappa", "a second")
@@ -197,7 +197,7 @@ def main(argv: list[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor; warp: its own")
-    parser.add_argument("--grasps", nargs="*", type=Path, default=list(FILES), help="files of stored grasps")
+    parser.add_argument("--grasps", nargs="*", type=Path, default=list(STORED), help="files of stored grasps")
     parser.add_argument("--num", type=int, default=400, help="grasps of each file")
     parser.add_argument("--protocols", nargs="+", default=["strict", "carry"])
     parser.add_argument("--worlds", nargs="*", type=int, default=[4096], help="trials at once, for their speed")

@@ -26,8 +26,8 @@ from typing import Any
 from dro_grasp.devices import require_device
 from dro_grasp.simulation.worlds import WARP
 from lab.benchmarks.device import MANY, ONE, SHARES, SINGLE
-from lab.benchmarks.device_trials import FILES
 from lab.benchmarks.report import emit, machine, note
+from lab.measurements import STORED
 from lab.runner import PACKAGE, code_hash, weights_hashes
 
 Found = dict[str, Any]  # What a part noted under a name
@@ -48,7 +48,7 @@ class Row:
 SMALL = {"cpu": "cpu", WARP: "cpu"}
 """Devices that rehearse, and where PyTorch computes with them."""
 BEGUN = "begun"  # Name of what tells of which state the rows after it are
-HANDS = tuple(path.stem for path in FILES)
+HANDS = tuple(path.stem for path in STORED)
 ROWS = (
     Row("one pair, 1,024 candidates, settled, the best 64 weighed", f"{ONE}, settled", "candidates/s", 500),
     Row("64 pairs of one hand, 16 candidates each, settled, the best of each weighed", f"{MANY}, settled", "candidates/s", 500),
@@ -57,6 +57,8 @@ ROWS = (
     Row("whole strict trials, the same", "whole strict trials", "1/s", 800),
     *(Row(f"synthesis, strict-valid, allegro on training objects, {share:.0%} of it confirmed", f"shard, {share:g} confirmed",
           "grasps/s", 500) for share in SHARES["gpu"]),
+    *(Row(f"share of that time in which the processor confirms, {share:.0%} confirmed", f"shard, {share:g} confirmed",
+          "%", 10, lambda f: 100 * f["judging"], True) for share in SHARES["gpu"]),
     Row("training, multi", "training, multi", "samples/s", 10_000),
     Row("training, paper size", "training, paper", "samples/s", 1_500),
     *(Row(f"verdicts of the processor, strict, {hand}", f"agreement, {hand}, strict", "%", 97,
@@ -77,7 +79,7 @@ def parts(device: str) -> list[tuple[list[str], list[str]]]:
          [*trials, "--grasps", "--settled", "0", "--worlds", "2" if small else "4096"]),
         (["training, multi", "training, paper"], ["training", *own, "--quick"]),
         (shards, ["device", *own, "--only", "shards", "--alone"]),
-        *(([f"agreement, {path.stem}, strict"], [*alike, "--grasps", str(path)]) for path in FILES),
+        *(([f"agreement, {path.stem}, strict"], [*alike, "--grasps", str(path)]) for path in STORED),
     ]
 
 
