@@ -64,6 +64,11 @@ def endless(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     return easy(job, tasks)
 
 
+def telling_process(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
+    """Fails with the number of its process."""
+    raise ObjectError(str(os.getpid()))
+
+
 def telling_threads(job: Job, tasks: Sequence[Task]) -> list[FinishedShard]:
     """Fails with the number of threads that the libraries of this process use."""
     import torch

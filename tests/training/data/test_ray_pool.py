@@ -107,6 +107,35 @@ def test_without_ray_the_engine_says_what_to_install(monkeypatch):
         RayPool(Job(0, EngineConfig()), 1, 60.0)
 
 
+ON_GPU = """
+import ray
+from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.training.data.engine.pools import RayPool
+from dro_grasp.training.data.engine.worker import EngineConfig, Job
+from tests.helpers.engine_work import telling_process
+
+if __name__ == "__main__":
+    ray.init(address="local", num_cpus=1, num_gpus=1, include_dashboard=False)  # there need be none
+    pool, told = RayPool(Job(0, EngineConfig(synthesis=SynthesisConfig(device="cuda"))), 1, 60, None, telling_process), []
+    for _ in range(3):
+        pool.submit([])
+        (_, failed), = pool.wait(60)
+        told.append(failed.reason)
+    print(" ".join(told))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_starts")
+def test_the_process_of_a_gpu_stays_with_all_that_it_has_compiled(tmp_path):
+    (tmp_path / "script.py").write_text(ON_GPU)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, timeout=300,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, [ROOT, ROOT / "src"]))}, check=True)
+    first, *others = done.stdout.split()
+    assert others == [first, first]
+
+
 DRIVER = """
 import sys
 import time

@@ -233,7 +233,8 @@ class RayTasks:
         options: dict[str, Any] = {"max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
         self.on_device = job.config.synthesis.device != "cpu"
         if self.on_device:
-            options["num_gpus"] = GPU_SHARE
+            # Ray would start a new process for each task, which would load and compile everything again.
+            options |= {"num_gpus": GPU_SHARE, "max_calls": 0}
         # Ray lets a task simulate in as many threads.
         _, options["num_cpus"] = shards_at_once(ray.cluster_resources(), self.on_device)
         # Errors come back as values, so Ray retries lost machines and nothing else.
