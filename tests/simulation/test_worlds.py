@@ -144,6 +144,20 @@ def test_fewer_grasps_than_threads_are_pulled_in_all_directions_at_once_with_the
     assert not Rollout(cached_scene(hand, obj, rules), grasps, 9, stride=10).spreads
 
 
+@pytest.mark.parametrize("rules", [CARRY, protocol("dexgraspbench"), protocol("strict")], ids=lambda rules: rules.name)
+def test_a_grasp_that_fails_as_it_closes_is_judged_where_there_are_more_threads_than_grasps(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, rules: Protocol
+) -> None:
+    """Then no force is left to try, in any direction."""
+    deep = grasps[0].replace(T_object_wrist=grasps[0].T_object_wrist + torch.tensor([0.0, 0.0, 0.03, 0.0])[:, None])
+    found = [simulate(hand, obj, deep, rules, workers=workers) for workers in (9, 1)]
+    same(*found)
+    assert found[0].failure[0] is not None
+    assert bool(found[0].displacement.isnan().all())
+    heavy = grasps[0].replace(payload=torch.tensor([1e-3]))  # what is held after it is known to be
+    assert torch.equal(*(weigh(hand, obj, heavy, rules, workers=workers) for workers in (9, 1)))
+
+
 def test_rows_that_do_not_step_stay_as_they_are_and_what_exploded_steps_no_more(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, steps: Callable[..., Steps]
 ) -> None:

@@ -106,6 +106,8 @@ class ProcessorWorlds:
 
     def ahead(self, rows: Int[np.ndarray, " k"], given: Values, count: int) -> Ahead:
         """As of `Worlds`."""
+        if not len(rows):
+            return Ahead({name: np.array(self.bind(name)[rows]) for name in STATE}, np.ones(0, bool))
         others = ProcessorWorlds(self._scene, len(rows), self._workers)
         for name in INPUTS:
             others.bind(name)[:] = given[name] if name in given else self.bind(name)[rows]
