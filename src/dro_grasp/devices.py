@@ -241,7 +241,9 @@ def fast_products() -> AbstractContextManager[None]:
     """Within the block, single-precision products on the CPU take the quick path if it is accurate here.
 
     The setting "medium" lets PyTorch choose another library, which is 2-4 times as fast on some processors at the same
-    accuracy. On others it rounds to half precision: a test product decides, once. CUDA's products it would round.
+    accuracy. On others it rounds to half precision: a test product decides, once. CUDA's products it would round. It is a
+    setting of the process: a block belongs around all that threads compute beside each other, or these round as the blocks of
+    other threads begin and end.
     """
     return nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH
 

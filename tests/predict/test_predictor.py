@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import math
 from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any, Never
 
 import pytest
 import torch
 from torch import Tensor
 
+from dro_grasp import devices
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.network import placement
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize import refinement
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.optimize.starts import Spread, wrist_rotations
 from dro_grasp.optimize.synthesis import SynthesisConfig
@@ -30,6 +35,7 @@ from dro_grasp.predict.finish import FinishConfig, Finished
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
+from dro_grasp.predict.sources import network as network_source
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.network import ProposalConfig, _placements
@@ -541,3 +547,35 @@ def test_what_is_no_source_is_refused_before_any_work() -> None:
         GraspRequest(source="magic")
     with pytest.warns(FutureWarning, match="source optimise is called optimiser now"):
         assert GraspRequest(source="optimise").source == "optimiser"
+
+
+def test_what_threads_compute_beside_each_other_rounds_in_one_way(
+    predictor: GraspPredictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a product rounds by whether another thread is in a block of quick products, and a seed has no one result."""
+    seen = []
+
+    def watched(work: Callable[..., Any], *parts: Iterable[Any]) -> list[Any]:
+        def alone(*job: Any) -> Any:
+            blocks.clear()
+            before = torch.get_float32_matmul_precision()
+            made = work(*job)
+            seen.append({before, *blocks, torch.get_float32_matmul_precision()})
+            return made
+
+        return [alone(*job) for job in zip(*parts, strict=True)]
+
+    def told(precision: str) -> None:
+        blocks.append(precision)
+        plain(precision)
+
+    blocks, plain = list[str](), torch.set_float32_matmul_precision
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", told)
+    monkeypatch.setattr(devices, "quick_path_is_accurate", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for module in (network_source, placement, refinement):
+        monkeypatch.setattr(module, "side_by_side", watched)
+    with contextlib.suppress(NoGraspError):
+        predictor.run(GraspProblem(HAND, load_object("sphere")), GraspRequest(16, source="network"))
+    assert all(len(settings) == 1 for settings in seen)
+    assert {"medium"} in seen

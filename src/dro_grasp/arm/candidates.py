@@ -14,7 +14,7 @@ from torch import Tensor
 from dro_grasp.arm.reachability import reachable_directions
 from dro_grasp.arm.task import Directions, Task
 from dro_grasp.arm.workcell import OBSTACLE
-from dro_grasp.devices import side_by_side
+from dro_grasp.devices import fast_products, side_by_side
 from dro_grasp.errors import NoGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import TABLE
@@ -91,7 +91,8 @@ def grasps_in_world(
             return error
 
     # Alone, a request uses all threads itself.
-    parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
+    with fast_products():
+        parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
     found = [part for part in parts if isinstance(part, GraspBatch)]
     if not found:
         raise next(part for part in parts if isinstance(part, NoGraspError))

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.devices import Rows, Stopwatch, at_once, on_accelerator, one_thread, side_by_side
+from dro_grasp.devices import Rows, Stopwatch, at_once, fast_products, on_accelerator, one_thread, side_by_side
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField, DistanceFields
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
@@ -251,14 +251,14 @@ def _distances(
     each = _one_by_one if len(parts) == 1 or on_accelerator(problem.device) else side_by_side
     centres = clouds.mean(1)
 
-    def move(part: slice) -> tuple[Moves, Float[Tensor, "c 3 3"], Float[Tensor, "c 1 1 3"]]:
+    def placed(part: slice) -> tuple[Float[Tensor, "..."], ...]:
         own = inputs.rows(part)
         T, which = own.placement.flatten(0, 1), own.which.repeat_interleave(rivals)
         axes = T[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
         centre = centres[which]
         opened = network.to_frame(hand.points(own.joints.repeat_interleave(rivals, 0), T), centre, axes)
         obj = network.to_frame(clouds[which], centre, axes)
-        return network.move(opened, obj, own.noise.flatten(0, 1)), axes, centre[:, None, None]
+        return opened, obj, own.noise.flatten(0, 1), axes, centre[:, None, None]
 
     def choose(moves: Moves, axes: Float[Tensor, "c 3 3"], centre: Float[Tensor, "c 1 1 3"], part: slice) -> Moves:
         points = moves.points @ axes[:, None].mT + centre
@@ -274,11 +274,13 @@ def _distances(
         return moves.pick(row, best[:, 0] % draws)
 
     with watch("network"):
-        moves, axes, middles = zip(*each(move, parts), strict=True)
+        *given, axes, middles = zip(*map(placed, parts), strict=True)
+        with fast_products():  # of all threads
+            moves = each(network.move, *given)
     if rivals * draws > 1:
         with watch("choose"):
             moves = each(choose, moves, axes, middles, parts)
-    with watch("network"):
+    with watch("network"), fast_products():
         return torch.cat(each(network.distances, moves)).float()
 
 
