@@ -245,9 +245,9 @@ def parts(results: Results) -> str:
 
 def scaling(results: Results) -> str:
     """As many shards for each process, however many there are."""
-    columns = ("processes", "shards", "time [s]", "efficiency", "CPU of the head [ms a shard]", "bytes a shard")
-    return table(("processes of", *columns), [
-        [engine, *(f"{row[name]:.3g}" for name in columns)]
+    return table(("engine", "processes", "shards", "time [s]", "efficiency", "CPU of the head [s]", "kB a shard"), [
+        [engine, row["processes"], row["shards"], f"{row['time [s]']:.1f}", f"{row['efficiency']:.2f}",
+         f"{row['CPU of the head [ms a shard]'] * row['shards'] / 1e3:.2f}", f"{row['bytes a shard'] / 1e3:.1f}"]
         for engine in ("local", "ray") for row in results.cell("scaling", engine)["rows"]])
 
 
