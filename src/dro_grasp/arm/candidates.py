@@ -90,9 +90,11 @@ def grasps_in_world(
         except NoGraspError as error:  # other directions may have some
             return error
 
-    # Alone, a request uses all threads itself.
-    with fast_products():
-        parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
+    if len(problems) == 1:  # it uses all threads itself
+        parts = [made(problem, request)]
+    else:
+        with fast_products():
+            parts = side_by_side(made, problems, requests)
     found = [part for part in parts if isinstance(part, GraspBatch)]
     if not found:
         raise next(part for part in parts if isinstance(part, NoGraspError))
