@@ -54,6 +54,7 @@ def simulate(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist, or the extra is missing.
     """
+    scene_of(hand, obj, grasps, protocol)  # what has no trial at all is told first
     if not another:
         grasps.require_object(obj)
     result, = simulate_many(
