@@ -34,7 +34,7 @@ CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 
 @dataclass(frozen=True)
 class Room:
-    """Memory for what touches in a world: as much as the closings of nine in fifteen hands need; others get twice as much.
+    """Memory for what touches in a world: as much as the closings of ten in fifteen hands need; others get twice as much.
 
     Counts are of lab/studies/contact_room.py.
     """
