@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -241,6 +245,18 @@ def test_payloads_and_answers_are_the_same_on_a_device(hand: Hand, obj: ObjectMo
     assert all(float(x.abs().max()) > 0 for x in found[0][1:])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-5)
+
+
+def test_kernels_lie_in_the_folder_of_their_version(tmp_path: Path) -> None:
+    """Also where another thread asks for Warp while it starts: what lies elsewhere is an older version's to Warp."""
+    pytest.importorskip("mujoco_warp")
+    code = ("from dro_grasp.simulation.warp_worlds import _modules; warp = _modules()[0]; warp.init(); "
+            "_modules.cache_clear(); print(_modules()[0].config.kernel_cache_dir, warp.config.version, end='')")
+    environment = {**os.environ, "DRO_GRASP_CACHE": str(tmp_path)}
+    environment.pop("WARP_CACHE_PATH", None)
+    printed = subprocess.run([sys.executable, "-c", code], env=environment, text=True, stdout=subprocess.PIPE, check=True)
+    folder, version = printed.stdout.splitlines()[-1].split()
+    assert Path(folder) == tmp_path / "kernels" / version
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ FEWEST = 128  # Worlds of a GPU's smallest graph; others have powers of two. Our
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
 SPARE = 0.01  # Share of worlds that may have more constraints than fit; they run on the processor (ours)
 LARGEST_ROOM = 1024  # Most contacts, and most constraints, that a world gets memory for (ours)
+_LOADING = threading.Lock()
 CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 
 
@@ -263,11 +264,12 @@ def _modules() -> tuple[ModuleType, ModuleType]:
         OptionError: The extra is missing.
     """
     require_extra("gpu")
-    import warp
+    with _LOADING:
+        import warp
 
-    warp.config.log_level = warp.LOG_WARNING
-    if "WARP_CACHE_PATH" not in os.environ:
-        warp.config.kernel_cache_dir = str(cache_folder() / "warp")
-    import mujoco_warp
+        warp.config.log_level = warp.LOG_WARNING
+        if "WARP_CACHE_PATH" not in os.environ and not warp.config.kernel_cache_dir:  # Warp adds its version, once
+            warp.config.kernel_cache_dir = str(cache_folder() / "kernels")
+        import mujoco_warp
 
-    return warp, mujoco_warp
+        return warp, mujoco_warp
