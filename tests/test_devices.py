@@ -9,17 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.devices import (
-    at_once,
-    choose_device,
-    cores,
-    may_hold,
-    on_device,
-    repeat,
-    require_device,
-    side_by_side,
-    where_any,
-)
+from dro_grasp.devices import at_once, choose_device, cores, may_hold, on_device, require_device, side_by_side, where_any
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.grasp_energy import link_spheres
@@ -138,43 +128,9 @@ def test_batches_follow_the_device_and_its_memory(monkeypatch: pytest.MonkeyPatc
     assert at_once("cuda", 32, 1e6, given=7) == 7
 
 
-def test_a_step_that_is_repeated_is_told_its_number(device: str) -> None:
-    table = torch.tensor([1.0, 10.0, 100.0, 1000.0, 1e4]).to(device)
-
-    def step(state: tuple[torch.Tensor, torch.Tensor], number: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        total, last = state
-        return total + table.index_select(0, number), 2 * last + total
-
-    begin = (torch.zeros(1).to(device), torch.ones(1).to(device))
-    total, last = repeat(step, begin, 5)
-    assert (total.item(), last.item()) == (11111.0, 32.0 + 8 * 1 + 4 * 11 + 2 * 111 + 1111)
-    assert (begin[0].item(), begin[1].item()) == (0.0, 1.0)
-
-
 def test_no_more_is_waited_for_than_the_cpu_s_own(device: str) -> None:
     mask = torch.tensor([False, True, True])
     assert where_any(mask).tolist() == [1, 2]
     assert where_any(mask.to(device)) == slice(None)
     assert not may_hold(torch.zeros(2, dtype=torch.bool))
     assert may_hold(torch.zeros(2, dtype=torch.bool).to(device))
-
-
-def test_what_repeated_steps_make_and_cache_can_be_differentiated() -> None:
-    kept: list[Tensor] = []
-
-    def step(x: Tensor, number: Tensor) -> Tensor:
-        if not kept:
-            kept.append(torch.full((2,), 3.0))
-        return x * kept[0]
-
-    with torch.no_grad():
-        end = repeat(step, torch.ones(2), 3)
-    assert end.tolist() == [27.0, 27.0]
-    factor = torch.ones(2, requires_grad=True)
-    (factor * end * kept[0]).sum().backward()
-    assert factor.grad is not None
-    assert factor.grad.tolist() == [81.0, 81.0]
-    end += 1  # nor is it forbidden to write to it
-    followed = torch.ones(2, requires_grad=True)
-    (gradient,) = torch.autograd.grad(repeat(step, followed, 3).sum(), followed)
-    assert gradient.tolist() == [27.0, 27.0], "where gradients are asked for, they are there"

@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool, Int, Shaped
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
@@ -146,95 +146,6 @@ def where_any(mask: Bool[Tensor, " n"]) -> Int[Tensor, " k"] | slice:
 def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
     """Whether a mask holds anywhere; on a device, which would have to be waited for, yes."""
     return bool(mask.any()) if mask.device.type == "cpu" else True
-
-
-FEWEST_CAPTURED = 4
-"""Fewer repetitions than these are not captured (ours): to capture a step takes as long as to launch it twice."""
-
-
-def repeat(step: Callable[[State, Int[Tensor, "1"]], State], state: State, times: int) -> State:
-    """The state after a step that is taken many times, and is told its number.
-
-    The step computes with tensors alone and waits for none of them. CUDA launches it once, as it is captured in a graph, and
-    then repeats the graph, so that launches cost nothing. What cannot be captured is launched each time.
-    """
-    first = _leaves(state)[0]
-    if _captures(first.device) and times >= FEWEST_CAPTURED and (graph := _captured(step, state)) is not None:
-        for _ in range(times):
-            graph.replay()
-        return graph.state
-    # Small operations take a sixth less time without what gradients need. What is cached was so by the first step, since
-    # tensors that are made without can never be differentiated.
-    bare = not torch.is_grad_enabled() and not torch.is_inference_mode_enabled() and first.device.type == "cpu"
-    for number in range(times):
-        with torch.inference_mode() if bare and number else nullcontext():
-            state = step(state, torch.full((1,), number, device=first.device))
-    return _rebuilt(state, iter([leaf.clone() for leaf in _leaves(state)])) if bare else state
-
-
-def _captures(device: torch.device) -> bool:
-    """Whether a device knows graphs."""
-    return device.type == "cuda"
-
-
-@dataclasses.dataclass(frozen=True)
-class _Graph:
-    """A captured step, which takes what is in `state` and leaves its result there."""
-
-    state: Any
-    replay: Callable[[], None]
-
-
-_WARM: set[Any] = set()  # Code of the steps that ran before: libraries set themselves up at first use, which is not captured
-_CAPTURING = threading.Lock()  # What another thread launches on the stream meanwhile would become part of the graph
-
-
-def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) -> _Graph | None:
-    """The step as a graph, which begins at a state; None if CUDA refuses."""
-    kept = _rebuilt(state, iter([leaf.clone() for leaf in _leaves(state)]))
-    device = _leaves(kept)[0].device
-    number = torch.zeros(1, dtype=torch.int64, device=device)
-    stream, graph = _capture_stream(device), torch.cuda.CUDAGraph()
-    stream.wait_stream(torch.cuda.current_stream(device))
-    try:
-        with _CAPTURING, torch.cuda.stream(stream):
-            if step.__code__ not in _WARM:
-                step(kept, number)
-                _WARM.add(step.__code__)
-            graph.capture_begin(capture_error_mode="thread_local")
-            try:
-                for old, new in zip(_leaves(kept), _leaves(step(kept, number)), strict=True):
-                    old.copy_(new)
-                number += 1
-            finally:
-                graph.capture_end()
-    except RuntimeError:
-        return None
-    torch.cuda.current_stream(device).wait_stream(stream)
-    return _Graph(kept, graph.replay)
-
-
-@cache
-def _capture_stream(device: torch.device) -> torch.cuda.Stream:
-    """The stream on which steps are captured: each stream keeps memory of its own."""
-    return torch.cuda.Stream(device)
-
-
-def _leaves(value: Any) -> list[Shaped[Tensor, "..."]]:
-    """The tensors of a tensor, a tuple, or a record of them."""
-    if isinstance(value, Tensor):
-        return [value]
-    parts = value if isinstance(value, tuple) else [getattr(value, f.name) for f in dataclasses.fields(value)]
-    return [leaf for part in parts for leaf in _leaves(part)]
-
-
-def _rebuilt(like: Any, leaves: Iterator[Shaped[Tensor, "..."]]) -> Any:
-    """Such a value of other tensors."""
-    if isinstance(like, Tensor):
-        return next(leaves)
-    if isinstance(like, tuple):
-        return tuple(_rebuilt(part, leaves) for part in like)
-    return type(like)(*(_rebuilt(getattr(like, f.name), leaves) for f in dataclasses.fields(like)))
 
 
 def fast_products() -> AbstractContextManager[None]:

@@ -106,19 +106,20 @@ def decode(
 
 def decode_segments(
     segments: Segments, distances: Float[Tensor, "b n m"], object_points: Float[Tensor, "b m 3"],
-    config: DecodeConfig | None = None,
+    config: DecodeConfig | None = None, among: Int[Tensor, " k"] | None = None,
 ) -> tuple[Float[Tensor, "b l 4 4"], Float[Tensor, "b l"], Float[Tensor, "b n 3"]]:
     """Poses of links of hands that may differ, what is left [m], and the clouds [m]; see `decode` and `LinkPoses`.
 
-    The segments are those of each row, or of one hand for all.
+    The segments are those of each row, or of one hand for all; `among` is that of `multilaterate`.
     """
     config = config or DecodeConfig()
     segments = segments.spread(len(distances))
-    both, flat = multilaterate(distances, object_points, config.multilateration)
+    both, flat = multilaterate(distances, object_points, config.multilateration, among)
     points = both[:, 0]
-    rows = flat.nonzero()[:, 0]
+    rows = flat.nonzero()[:, 0] if among is None else among
     if len(rows):
         second = _sides(segments.rows(rows), both[rows].detach(), distances[rows].detach(), object_points[rows], config)
+        second = second & flat[rows, None]
         points = points.index_put((rows,), torch.where(second[..., None], both[rows, 1], both[rows, 0]))
     poses, residual = register(segments.local, segments.of_points(points), segments.weight)
     return poses, residual, points

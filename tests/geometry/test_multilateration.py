@@ -5,7 +5,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp.geometry.multilateration import MultilaterationConfig, choose_sides, distance_misfit, multilaterate
+from dro_grasp.geometry.multilateration import (
+    MultilaterationConfig,
+    choose_sides,
+    distance_misfit,
+    leading_eigenvector,
+    multilaterate,
+    thin_rows,
+)
 from dro_grasp.geometry.se3 import roma
 
 
@@ -88,6 +95,62 @@ def test_thick_clouds_have_one_candidate():
     assert not flat.any()
     assert torch.equal(both[:, 0], both[:, 1])
     np.testing.assert_allclose(both[:, 0], points, atol=2e-5)
+
+
+def mixed() -> tuple[Tensor, Tensor]:
+    """Distances and anchors of five clouds, of which the second and the last are thin."""
+    scenes = [scene((), thickness, noise=0.003)[1:] for thickness in (0.03, 0.001, 0.03, 0.02, 0.002)]
+    anchors, distances = (torch.stack(values) for values in zip(*scenes, strict=True))
+    return distances, anchors
+
+
+def test_rows_of_thin_clouds_are_found_where_there_is_room():
+    _, anchors = mixed()
+    assert thin_rows(anchors, 2).tolist() == [1, 4]
+    assert thin_rows(anchors, 3).tolist() == [1, 4, 0]
+    assert thin_rows(anchors, 1).tolist() == [1, 4, 0, 2, 3], "all, rather than some of the thin ones"
+
+
+@pytest.mark.parametrize("room", [2, 4, 5])
+def test_thin_clouds_among_given_rows_are_placed_as_those_that_are_looked_for(room: int, device: str):
+    distances, anchors = (values.to(device) for values in mixed())
+    expected, flat = multilaterate(distances, anchors)
+    found, same = multilaterate(distances, anchors, among=thin_rows(anchors, room))
+    assert flat.tolist() == same.tolist() == [False, True, False, False, True]
+    torch.testing.assert_close(found.cpu(), expected.cpu(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_a_device_places_points_as_the_cpu_does(noise: float, device: str):
+    _, anchors, distances = scene((3,), 0.002, noise)
+    for given in (mixed(), (distances, anchors)):
+        here, there = multilaterate(*given)[0], multilaterate(*(values.to(device) for values in given))[0].cpu()
+        mirrored = (here - there.flip(1)).norm(dim=-1) < (here - there).norm(dim=-1)  # axes have no sign
+        there = torch.where(mirrored[..., None], there.flip(1), there)
+        apart = (here - there).norm(dim=-1)
+        assert apart.quantile(0.95) < 1e-5
+        assert apart.max() < 5e-4, "where noise leaves a shallow minimum"
+
+
+@pytest.mark.parametrize("size", [3, 4])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e5])
+def test_the_leading_eigenvector_is_that_of_lapack(size: int, scale: float):
+    matrix = torch.randn(200, size, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    matrix = scale * (matrix + matrix.mT)
+    values, vectors = np.linalg.eigh(matrix.numpy())
+    apart = (values[:, -1] - values[:, -2]) / np.abs(values).max(1)
+    found = leading_eigenvector(matrix).numpy()
+    aligned = np.abs((found * vectors[:, :, -1]).sum(-1))
+    assert apart.min() > 1e-3
+    np.testing.assert_allclose(aligned, 1, atol=1e-9)
+    single = leading_eigenvector(matrix.float()).numpy()
+    np.testing.assert_allclose(np.abs((single * vectors[:, :, -1]).sum(-1))[apart > 0.05], 1, atol=1e-5)
+
+
+def test_of_two_leading_eigenvectors_some_vector_of_both_is_found():
+    found = leading_eigenvector(torch.diag(torch.tensor([2.0, 2.0, -3.0])))
+    assert found.norm() == pytest.approx(1)
+    assert found[2] == pytest.approx(0)
 
 
 def test_a_cloud_does_not_depend_on_its_neighbours_in_the_batch():

@@ -1,7 +1,7 @@
 """A strict accelerator without hardware: its tensors compute on the CPU, but meet the CPU's as rarely as a GPU's do.
 
 Inside `fake_device()` the device named `DEVICE` exists. A tensor on it is a `DeviceTensor`, which holds a CPU tensor and
-shows another device. Every operation passes `_run`, below autograd, which refuses what CUDA refuses, computes on the held
+shows another device. Every operation passes `compute`, below autograd, which refuses what CUDA refuses, computes on the held
 tensors, and wraps the results. Results are therefore those of the CPU to the last bit.
 """
 
@@ -60,7 +60,7 @@ class DeviceTensor(torch.Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _run(operation, args, kwargs or {})
+        return compute(operation, args, kwargs or {})
 
     @property
     def is_cuda(self) -> bool:
@@ -118,11 +118,11 @@ class _Dispatch(TorchDispatchMode):
     """Sees the operations that have no tensor of the device among their arguments: factories and copies to it."""
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _run(operation, args, kwargs or {})
+        return compute(operation, args, kwargs or {})
 
 
 class _Functions(TorchFunctionMode):
-    """Turns what PyTorch would make of Python data on its own into steps that `_run` sees."""
+    """Turns what PyTorch would make of Python data on its own into steps that `compute` sees."""
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -168,7 +168,7 @@ def _form(operation: Any) -> _Form:
     return _Form(written, torch.Tag.pointwise in operation.tags or operation in SCALARS)
 
 
-def _run(operation: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
+def compute(operation: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """Compute an operation on the tensors held, after the checks of CUDA."""
     form, leaves = _form(operation), []
     _collect(args, leaves)

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dro_grasp import devices
 from dro_grasp.geometry.contact_forces import nonnegative_least_squares
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.joint_solver import Targets, solve_joints
@@ -88,8 +87,8 @@ def test_descents_that_are_captured_take_hardly_any(name: str, monkeypatch: pyte
         graph.replay = replay
         return graph
 
-    monkeypatch.setattr(devices, "_captures", lambda device: device.type == DEVICE)
-    monkeypatch.setattr(devices, "_captured", captured)
+    monkeypatch.setattr(graphs, "captures", lambda device: device.type == DEVICE)
+    monkeypatch.setattr(graphs, "_captured", captured)
     seen = counted(load_hand("allegro"), name, 8)
     assert seen.count <= CAPTURED[name] < whole.count / 2
 

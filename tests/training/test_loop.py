@@ -12,15 +12,16 @@ from torch import Tensor, nn
 
 from dro_grasp import distance_matrix
 from dro_grasp.errors import TrainingError
+from dro_grasp.network.encoder import StaticGraphEncoder
 from dro_grasp.network.network import DistanceNetwork, NetworkOutput
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, write_bundle
 from dro_grasp.training.loop import measure_hands, train
 from dro_grasp.training.measures import matching_rank
-from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
+from dro_grasp.training.pretraining import contrastive_step, posture_clouds, pretrain_motion
 from dro_grasp.training.runs import recalibrate
-from dro_grasp.training.samples import SampleSource
+from dro_grasp.training.samples import Batch, SampleSource
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import TINY, ellipsoid, made_up_grasps
 from tests.helpers.toy_hand import toy_hand
@@ -63,6 +64,11 @@ def test_fine_tuning_goes_on_from_given_weights(
     assert all(torch.equal(before[name], value) for name, value in after.items()), "the hand encoder is kept"
 
 
+def contrast(encoder: StaticGraphEncoder, source: SampleSource, generator: torch.Generator) -> Tensor:
+    config = PretrainConfig(hands_per_step=1)
+    return contrastive_step(encoder, posture_clouds(source, config, generator), config)
+
+
 def test_recalibration_measures_what_the_weights_make_of_the_data(bundle: Bundle) -> None:
     torch.manual_seed(0)
     encoder, source = DistanceNetwork(TINY).hand_encoder.train(), SampleSource(bundle, TINY, AugmentationConfig())
@@ -73,9 +79,7 @@ def test_recalibration_measures_what_the_weights_make_of_the_data(bundle: Bundle
     for parameter in encoder.parameters():
         nn.init.normal_(parameter)
     encoder.add_module("frozen", frozen)
-    recalibrate(
-        encoder, lambda: contrastive_step(encoder, source, PretrainConfig(hands_per_step=1), generator), batches=5
-    )
+    recalibrate(encoder, lambda: contrast(encoder, source, generator), batches=5)
     assert len(inputs) == 5
     torch.testing.assert_close(norm.running_mean, torch.stack([x.mean(0) for x in inputs]).mean(0))
     torch.testing.assert_close(norm.running_var, torch.stack([x.var(0) for x in inputs]).mean(0))
@@ -93,7 +97,7 @@ def test_statistics_returned_belong_to_the_weights_returned(bundle: Bundle, tmp_
     source, generator = SampleSource(bundle, TINY, AugmentationConfig()), torch.Generator().manual_seed(5)
     for _ in range(20):
         if stage == "pretrain":
-            contrastive_step(model.hand_encoder, source, PretrainConfig(hands_per_step=1), generator)
+            contrast(model.hand_encoder, source, generator)
         else:
             hand = source.draw("toy", 4, generator).placed
             model.hand_encoder(hand - hand.mean(1, keepdim=True))
@@ -109,8 +113,8 @@ def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
     torch.manual_seed(0)
     source, generator = SampleSource(bundle, TINY, AugmentationConfig(partial=0.5)), torch.Generator().manual_seed(0)
     weights = LossConfig(2.0, 3.0, 5.0, 7.0, form, placement=11.0)
-    model, groups = DistanceNetwork(TINY), [source.draw("toy", 3, generator)]
-    values = loop.step_losses(model, groups, TrainConfig(losses=weights, columns=24), generator)
+    model, batch = DistanceNetwork(TINY), Batch.of([source.draw("toy", 3, generator)])
+    values = loop.step_losses(model, batch, TrainConfig(losses=weights, columns=24), generator)
     found = {name: float(value.detach()) for name, value in values.items()}
     assert found["total"] == pytest.approx(sum(getattr(weights, n) * v for n, v in found.items() if n not in {"total", "nats"}))
     assert found["nats"] > 0
@@ -134,7 +138,7 @@ def test_losses_of_several_hands_are_those_of_each_by_itself(points: int, links:
     assert bool(source.segments.kept.all()) == (points == 96)
     groups = [source.draw(hand.name, 3, torch.Generator().manual_seed(i)) for i, hand in enumerate(hands)]
     network = Noisy(dataclasses.replace(TINY, frame="object"))
-    found = loop.step_losses(network, groups, TrainConfig(columns=24), torch.Generator().manual_seed(2))
+    found = loop.step_losses(network, Batch.of(groups), TrainConfig(columns=24), torch.Generator().manual_seed(2))
     obj, grasp = (torch.cat([getattr(g, name) for g in groups]) for name in ("obj", "grasp"))
     output = network(grasp, obj, grasp, torch.Generator().manual_seed(2), 24)
     poses, depths = [], []
@@ -158,7 +162,8 @@ def test_prior_and_motion_learn(bundle: Bundle) -> None:
     torch.manual_seed(0)
     source, generator = SampleSource(bundle, TINY, AugmentationConfig()), torch.Generator().manual_seed(0)
     model = DistanceNetwork(TINY)
-    loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
+    batch = Batch.of([source.draw("toy", 3, generator)])
+    loop.step_losses(model, batch, TrainConfig(columns=24), generator)["total"].backward()
     assert model.prior.leave.weight.grad.abs().max() > 0
     assert model.motion.last.weight.grad.abs().max() > 0
 
@@ -169,7 +174,8 @@ def test_a_placement_prior_learns_from_proportions(bundle: Bundle) -> None:
     model = DistanceNetwork(TINY)
     measure_hands(model, source)
     state = torch.get_rng_state()
-    loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
+    batch = Batch.of([source.draw("toy", 3, generator)])
+    loop.step_losses(model, batch, TrainConfig(columns=24), generator)["total"].backward()
     assert torch.equal(torch.get_rng_state(), state)
     assert model.placement.hand.weight.grad.abs().max() > 0, "noise tells a single hand's rows apart"
     assert all(p.grad is None or not p.grad.any() for name, p in model.hand_encoder.named_parameters() if "place" in name)

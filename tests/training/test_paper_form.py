@@ -26,7 +26,7 @@ from dro_grasp.predict.sources.network import ProposalConfig, _placements
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
-from dro_grasp.training.pretraining import contrastive_step
+from dro_grasp.training.pretraining import contrastive_step, posture_clouds
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import TINY
@@ -73,7 +73,7 @@ def test_pretraining_tilts_the_open_hand_as_training_does(bundle: Bundle) -> Non
     source = SampleSource(bundle, PAPER, AugmentationConfig())
     config = PretrainConfig(hands_per_step=1, samples_per_hand=COUNT)
     with torch.no_grad():
-        contrastive_step(encoder, source, config, torch.Generator().manual_seed(0))
+        contrastive_step(encoder, posture_clouds(source, config, torch.Generator().manual_seed(0)), config)
     grasping, opened = (wrist_turns(source.hands["toy"], clouds) for clouds in seen[0].chunk(2))
     assert kstest((opened * grasping.inv()).magnitude() / np.radians(30), "uniform").pvalue > 1e-3
     stored = Rotation.from_matrix(source.grasps["toy"].T_object_wrist[:, :3, :3].numpy())

@@ -15,7 +15,7 @@ from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.training.config import AugmentationConfig, PlacementConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
 from dro_grasp.training.loop import placement_losses, train_placement
-from dro_grasp.training.samples import SampleSource
+from dro_grasp.training.samples import Batch, SampleSource
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, curve, quiet
 
@@ -61,7 +61,7 @@ def test_preferred_is_the_area_under_the_roc_curve(bundle: Bundle, given: Distan
     prior, hand = given.placement, group.proportions.expand(40, -1)
     assert prior is not None
     with torch.no_grad():
-        found = placement_losses(prior, [group], 0.0, torch.Generator())
+        found = placement_losses(prior, Batch.of([group]), 0.0, torch.Generator())
         true, other = prior(group.obj_hand, hand)[3], prior(group.obj_random, hand)[3]
     expected = mannwhitneyu(true.numpy(), other.numpy()).statistic / 40**2
     assert float(found["preferred"]) == pytest.approx(expected, abs=1e-6)

@@ -267,7 +267,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
         raise AssertionError("the work began")
 
     monkeypatch.setattr(loop, "step_losses", working)
-    monkeypatch.setattr(pretraining, "contrastive_step", working)
+    monkeypatch.setattr(pretraining, "posture_clouds", working)
     (tmp_path / "file").write_text("")
     for stage in STAGES:
         for folder in (tmp_path / "file", tmp_path / "file" / "runs" / "main"):

@@ -15,7 +15,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.network.network import untrained_network
 from dro_grasp.training.config import AugmentationConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, write_bundle
-from dro_grasp.training.pretraining import contrastive_step
+from dro_grasp.training.pretraining import contrastive_step, posture_clouds
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
 from tests.helpers.toy_hand import toy_hand
@@ -84,7 +84,7 @@ def test_pretraining_learns_from_hands_without_grasps(mixed: SampleSource, frame
     source, config = SampleSource(bundle, network, AugmentationConfig()), PretrainConfig(hands_per_step=2, samples_per_hand=3)
     encoder, seen = untrained_network(network, 0).hand_encoder, []
     encoder.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
-    loss = contrastive_step(encoder, source, config, torch.Generator().manual_seed(0))
+    loss = contrastive_step(encoder, posture_clouds(source, config, torch.Generator().manual_seed(0)), config)
     assert bool(loss.isfinite())
     assert seen[0].shape == (12, TINY.n_hand, 3), "three of each hand, grasping and open"
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import repeat
+from dro_grasp.graphs import repeat
 
 
 def nonnegative_least_squares(

@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import at_once
+from dro_grasp.devices import at_once, on_accelerator
 from dro_grasp.geometry.se3 import apply_to_cloud, register
 from dro_grasp.kinds import Checked
+
+THIN = 5e-3  # A cloud is thin if the standard deviation along its thinnest axis is below this [m]. Source: ours
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,7 @@ class MultilaterationConfig(Checked):
     """Settings of the closed form and of the refinement. Values are ours."""
 
     ridge: float = 1e-8  # added to the anchors' covariance, so that flat clouds stay solvable [m^2]
-    thin: float = 5e-3  # a cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]
+    thin: float = THIN  # a cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]
     steps: int = 4  # Gauss-Newton steps of the refinement
     damping: float = 1e-4  # added to the Gauss-Newton matrix, per anchor [1]
     max_step: float = 0.05  # longest Gauss-Newton step [m]
@@ -30,20 +32,23 @@ class MultilaterationConfig(Checked):
 
 ON_CPU = 4  # Clouds that are refined at once on a CPU: more do not fit its cache (ours, timed)
 COPIES = 6  # Copies of the distances that a step of the refinement needs (ours, counted)
+SQUARINGS = 18  # Of a matrix whose leading eigenvector is left: enough for eigenvalues that differ by a ten-thousandth (ours)
 
 
 @dataclass(frozen=True)
 class _Cloud:
-    """Anchors about their mean, with their principal axes."""
+    """Anchors about their mean, and how they spread."""
 
     centre: Float[Tensor, "*b 1 3"]
     points: Float[Tensor, "*b m 3"]
-    axes: Float[Tensor, "*b 3 3"]  # principal axes as columns, the thinnest first
-    variance: Float[Tensor, "*b 3"]  # variance along each axis [m^2], ascending
+    inverse: Float[Tensor, "*b 3 3"]  # of their covariance and the ridge [1/m^2]
+    normal: Float[Tensor, "*b 3"]  # the axis along which they vary the least
+    variance: Float[Tensor, "*b"]  # along it [m^2]
 
 
 def multilaterate(
-    distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"], config: MultilaterationConfig | None = None
+    distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"], config: MultilaterationConfig | None = None,
+    among: Int[Tensor, " k"] | None = None,
 ) -> tuple[Float[Tensor, "*b 2 n 3"], Bool[Tensor, "*b"]]:
     """Points whose distances to the anchors are closest to the given ones [m]: both candidates where the anchors are flat.
 
@@ -53,19 +58,31 @@ def multilaterate(
 
     Differs from the paper: its argmin of squared distances to the fourth power is replaced by the linear problem,
     which has one minimum, and on thin clouds by unsquared distances, which weigh noise evenly.
+
+    `among` are rows of a batch of one axis among which all thin clouds are, as `thin_rows` tells: without them a device is
+    waited for.
     """
     config = config or MultilaterationConfig()
-    cloud = _spread(anchors)
-    flat = cloud.variance[..., 0] < config.thin**2
-    plain = _closed_form(distances, cloud, config)
+    cloud = _spread(anchors, config)
+    flat = cloud.variance < config.thin**2
+    plain = _closed_form(distances, cloud)
     both = torch.stack([plain, plain], -3)
-    if bool(flat.any()):
-        normal = cloud.axes[..., None, :, 0]
+    if bool(flat.any()) if among is None else len(among):
+        normal = cloud.normal[..., None, :]
         height = _height(plain, distances, cloud)[..., None] * normal
         # The closed form carries a large error along the thin axis; the height comes from the distances alone.
         level = plain - (plain * normal).sum(-1, keepdim=True) * normal
-        both = _refine_where(flat, torch.stack([level + height, level - height], -3), both, distances, cloud, config)
+        start = torch.stack([level + height, level - height], -3)
+        both = _refine_where(flat, start, both, distances, cloud, config, among)
     return both + cloud.centre[..., None, :, :], flat
+
+
+def thin_rows(anchors: Float[Tensor, "b m 3"], room: int, config: MultilaterationConfig | None = None) -> Int[Tensor, " k"]:
+    """So many rows of a batch, among them those of all thin clouds; all rows where there is not room enough. It waits."""
+    config = config or MultilaterationConfig()
+    flat = _spread(anchors, config).variance < config.thin**2
+    order = flat.to(torch.uint8).argsort(descending=True, stable=True)
+    return order[:room] if int(flat.sum()) <= room else order
 
 
 def distance_misfit(
@@ -76,23 +93,46 @@ def distance_misfit(
     return (_distances(points - centre, anchors - centre) - distances).square().mean(-1)
 
 
-def _spread(anchors: Float[Tensor, "*b m 3"]) -> _Cloud:
+def _spread(anchors: Float[Tensor, "*b m 3"], config: MultilaterationConfig) -> _Cloud:
     centre = anchors.mean(-2, keepdim=True)
     points = anchors - centre
     with torch.no_grad():
         covariance = points.mT @ points / anchors.shape[-2]
-        variance, axes = torch.linalg.eigh(covariance)
-    return _Cloud(centre, points, axes, variance.clamp(min=0))
+        if on_accelerator(points.device):  # where decompositions wait until it can be read that they succeeded
+            ridge = config.ridge * torch.eye(3, dtype=points.dtype, device=points.device)
+            inverse = torch.linalg.inv_ex(covariance + ridge).inverse
+            normal = leading_eigenvector(inverse)
+            variance = (normal * (covariance @ normal[..., None])[..., 0]).sum(-1)
+        else:
+            variances, axes = torch.linalg.eigh(covariance)
+            variances = variances.clamp(min=0)
+            inverse = axes @ ((1 / (variances + config.ridge))[..., None] * axes.mT)
+            normal, variance = axes[..., 0], variances[..., 0]
+    return _Cloud(centre, points, inverse, normal, variance)
 
 
-def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig) -> Float[Tensor, "*b n 3"]:
+def leading_eigenvector(matrix: Float[Tensor, "*b k k"]) -> Float[Tensor, "*b k"]:
+    """The unit eigenvector of the largest eigenvalue of a symmetric matrix, by squaring it; no device is waited for.
+
+    Where the two largest agree to a ten-thousandth of the matrix's norm, it is some vector of both.
+    """
+    norm = torch.linalg.matrix_norm(matrix)[..., None, None]
+    # With its norm added, the matrix has no negative eigenvalue, and the largest is the largest in magnitude.
+    power = matrix + norm * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    for _ in range(SQUARINGS):
+        power = power / power.abs().amax((-2, -1), keepdim=True)
+        power = power @ power
+    longest = power.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*power.shape[:-1], 1)
+    vector = power.gather(-1, longest)[..., 0]
+    return vector / vector.norm(dim=-1, keepdim=True)
+
+
+def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud) -> Float[Tensor, "*b n 3"]:
     """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows."""
     # With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves 2 q.p =
     # (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
     q = cloud.points
-    count = q.shape[-2]
-    inverse = cloud.axes @ ((1 / (cloud.variance + config.ridge))[..., None] * cloud.axes.mT)
-    weights = q @ inverse / (2 * count)
+    weights = q @ cloud.inverse / (2 * q.shape[-2])
     # Subtracting the mean of each row changes nothing in exact arithmetic (the weights sum to zero) and saves digits.
     squared = q.square().sum(-1)[..., None, :] - distances.square()
     return (squared - squared.mean(-1, keepdim=True)) @ weights
@@ -100,7 +140,7 @@ def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: Mult
 
 def _height(start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud) -> Float[Tensor, "*b n"]:
     """Distance of each point from the anchors' plane, by Pythagoras from its distances and its place in the plane [m]."""
-    normal = cloud.axes[..., :, 0]
+    normal = cloud.normal
     level = start - (start * normal[..., None, :]).sum(-1, keepdim=True) * normal[..., None, :]
     in_plane = level.square().sum(-1) + cloud.points.square().sum(-1).mean(-1)[..., None]
     return (distances.square().mean(-1) - in_plane).clamp(min=1e-6).sqrt()
@@ -108,16 +148,19 @@ def _height(start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], 
 
 def _refine_where(
     chosen: Bool[Tensor, "*b"], start: Float[Tensor, "*b 2 n 3"], otherwise: Float[Tensor, "*b 2 n 3"],
-    distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig,
+    distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig, among: Int[Tensor, " k"] | None,
 ) -> Float[Tensor, "*b 2 n 3"]:
-    """Refine the chosen clouds of the batch from both sides, and leave the others."""
+    """Refine the chosen clouds of the batch, which are some of given rows, from both sides, and leave the others."""
     shape, n, m = start.shape, start.shape[-2], cloud.points.shape[-2]
-    rows = chosen.reshape(-1).nonzero()[:, 0]
+    rows = chosen.reshape(-1).nonzero()[:, 0] if among is None else among
     start, distances = start.reshape(-1, 2, n, 3), distances.reshape(-1, 1, n, m)
     anchors = cloud.points.reshape(-1, 1, m, 3)
     size = at_once(start.device, ON_CPU, 2 * COPIES * n * m * start.element_size(), config.chunk)
     parts = [_refine(start[part], distances[part], anchors[part], config) for part in rows.split(size)]
-    return otherwise.reshape(-1, 2, n, 3).index_put((rows,), torch.cat(parts)).reshape(shape)
+    otherwise, found = otherwise.reshape(-1, 2, n, 3), torch.cat(parts)
+    if among is not None:
+        found = torch.where(chosen[rows, None, None, None], found, otherwise[rows])
+    return otherwise.index_put((rows,), found).reshape(shape)
 
 
 def _refine(
@@ -227,11 +270,11 @@ def _cut(
     products = x[..., rows] * x[..., columns] * (2 - (rows == columns).to(x)) * weight[..., None]
     normal = products.mT @ products + config.ridge * torch.eye(10, dtype=x.dtype, device=x.device)
     squares = (height / size[..., 0]).square() * weight
-    fit = torch.linalg.solve(normal, products.mT @ squares[..., None])[..., 0]
+    fit = torch.linalg.solve_ex(normal, products.mT @ squares[..., None]).result[..., 0]  # without waiting for its success
     matrix = fit.new_zeros(*fit.shape[:-1], 4, 4)
     matrix[..., rows, columns] = fit
     matrix[..., columns, rows] = fit
-    leading = torch.linalg.eigh(matrix)[1][..., -1]
+    leading = leading_eigenvector(matrix) if on_accelerator(matrix.device) else torch.linalg.eigh(matrix)[1][..., -1]
     return (x * leading[..., None, :]).sum(-1) > 0
 
 

@@ -56,7 +56,7 @@ class DistanceHead(nn.Module):
         pairs: Tensor = fused.PairLayers.apply(*values, rounded) if fused else _PairLayers.apply(*values)  # type: ignore[assignment]
         logits = pairs + self.last.bias
         if base is not None:
-            offset = inverse_softplus(torch.tensor(self.initial_distance)).to(base)
+            offset = float(inverse_softplus(torch.tensor(self.initial_distance, device="cpu")))
             logits = logits - offset + inverse_softplus(base)
         return functional.softplus(logits)
 

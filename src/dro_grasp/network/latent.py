@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dro_grasp.devices import repeat
+from dro_grasp.graphs import repeat
 from dro_grasp.network.encoder import SLOPE, EdgeLayer, Graph, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0  # Log-variances of z are clamped to plus and minus this. Source: ours

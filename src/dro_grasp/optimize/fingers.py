@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dro_grasp.devices import at_once, may_hold, repeat, where_any
+from dro_grasp.devices import at_once, may_hold, where_any
+from dro_grasp.graphs import repeat
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked

@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import Rows, at_once, repeat, side_by_side
+from dro_grasp.devices import Rows, at_once, side_by_side
 from dro_grasp.geometry.se3 import roma, rotated_about
+from dro_grasp.graphs import repeat
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked

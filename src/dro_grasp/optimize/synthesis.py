@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp._version import __version__
-from dro_grasp.devices import Rows, at_once, on_device, repeat
+from dro_grasp.devices import Rows, at_once, on_device
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.se3 import roma, turned_about
+from dro_grasp.graphs import repeat
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import DEPTH, ENERGY_TERM
 from dro_grasp.hands.hand import Hand

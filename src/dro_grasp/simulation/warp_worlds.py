@@ -29,7 +29,7 @@ FEWEST = 128  # Worlds of a GPU's smallest graph; others have powers of two. Our
 LARGEST = 1e10  # Positions and velocities above it count as exploded. Source: mjMAXVAL of MuJoCo
 SPARE = 0.01  # Share of worlds that may have more constraints than fit; they run on the processor (ours)
 LARGEST_ROOM = 1024  # Most contacts, and most constraints, that a world gets memory for (ours)
-_LOADING = threading.Lock()
+_LOADING = threading.Lock()  # Two threads that load Warp at once would tell it two folders
 CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 
 

@@ -5,12 +5,9 @@ Source: paper section III-E; the prior is ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from dro_grasp import distance_matrix
 from dro_grasp.errors import TrainingError
@@ -22,7 +19,7 @@ from dro_grasp.training import losses
 from dro_grasp.training.config import PlacementConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
 from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate, run_plan
-from dro_grasp.training.samples import HandSamples, SampleSource
+from dro_grasp.training.samples import Batch, SampleSource
 
 
 def train(
@@ -70,51 +67,40 @@ def train(
         # train() would put the frozen encoder's BatchNorm back into training mode.
         model.hand_encoder.eval()
 
-    draw = _drawing(source, config)
-    run.train(lambda: step_losses(model, run.drawn(draw), config, generator), report or console_report("training"))
+    def draw(generator: torch.Generator) -> Batch:
+        return source.draw_batch(config.hands_per_step, config.samples_per_hand, config.by_count, config.columns, generator)
+
+    def forward() -> None:
+        batch = draw(generator)
+        model(batch.placed, batch.obj, batch.grasp, generator, columns=1)
+
+    run.train(lambda batch: step_losses(model, batch, config, generator), report or console_report("training"), draw)
     run.seed_shard()
-    recalibrate(model, lambda: model(*_clouds(draw(generator)), generator, columns=1), config.schedule.recalibration)
+    recalibrate(model, forward, config.schedule.recalibration)
     model.mixed = False
     return model.cpu().eval()
 
 
 def step_losses(
-    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, generator: torch.Generator
+    model: DistanceNetwork, batch: Batch, config: TrainConfig, generator: torch.Generator
 ) -> Losses:
     """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`."""
-    placed, obj, grasp = _clouds(groups)
-    output = model(placed, obj, grasp, generator, columns=config.columns)
-    anchors = obj[:, : config.columns]
-    parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
-    segments = distance_matrix.together([group.segments for group in groups])
-    T, _, _ = distance_matrix.decode_segments(segments, output.distances, anchors)
-    true = torch.cat([group.T_frame_link[:, group.segments.links[0]] for group in groups])
-    parts["pose"] = losses.pose_loss(T, true, segments.real).mean()
-    local = torch.cat([group.hand.link_points.expand(len(group.placed), -1, -1) for group in groups])
-    posed, normals = apply(segments.poses_of_points(T), local), torch.cat([group.normals for group in groups])
-    parts["penetration"] = losses.penetration_loss(posed, obj, normals, segments.kept).mean()
+    output = model(batch.placed, batch.obj, batch.grasp, generator, columns=config.columns)
+    anchors = batch.obj[:, : config.columns]
+    parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(batch.grasp, anchors))}
+    T, _, _ = distance_matrix.decode_segments(batch.segments, output.distances, anchors, among=batch.thin)
+    parts["pose"] = losses.pose_loss(T, batch.T_frame_link, batch.segments.real).mean()
+    posed = apply(batch.segments.poses_of_points(T), batch.local)
+    parts["penetration"] = losses.penetration_loss(posed, batch.obj, batch.normals, batch.segments.kept).mean()
     nats = losses.divergence(output.mean, output.log_variance)
     parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form)
     if model.placement is not None:
-        parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
+        parts["motion"] = (output.moved - batch.grasp).norm(dim=-1).mean()
         parts["flow"] = output.flow_error.mean()
-        parts["placement"] = placement_losses(model.placement, groups, config.augmentation.proportions, generator)["total"]
+        parts["placement"] = placement_losses(model.placement, batch, config.augmentation.proportions, generator)["total"]
     weights = {name: getattr(config.losses, name) for name in parts}
     total = torch.stack([weights[name] * value for name, value in parts.items()]).sum()
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
-
-
-def _drawing(
-    source: SampleSource, config: TrainConfig | PlacementConfig
-) -> Callable[[torch.Generator], list[HandSamples]]:
-    """What draws the samples of a shard."""
-    return lambda generator: source.draw_all(
-        source.draw_hands(config.hands_per_step, generator, config.by_count), config.samples_per_hand, generator)
-
-
-def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
-    placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
-    return placed, obj, grasp
 
 
 def train_placement(
@@ -134,12 +120,13 @@ def train_placement(
     plan = run_plan(config, bundle, network, initial=initial)
     run = TrainingRun(folder, prior, config.schedule, generator, processes, plan)
 
-    draw = _drawing(source, config)
+    def draw(generator: torch.Generator) -> Batch:
+        return source.draw_batch(config.hands_per_step, config.samples_per_hand, config.by_count, None, generator)
 
-    def step() -> Losses:
-        return placement_losses(prior, run.drawn(draw), config.augmentation.proportions, generator)
+    def step(batch: Batch) -> Losses:
+        return placement_losses(prior, batch, config.augmentation.proportions, generator)
 
-    run.train(step, report or console_report("placement"))
+    run.train(step, report or console_report("placement"), draw)
     return model.cpu().eval()
 
 
@@ -150,17 +137,16 @@ def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
 
 
 def placement_losses(
-    prior: PlacementPrior, groups: list[HandSamples], noise: float, generator: torch.Generator
+    prior: PlacementPrior, batch: Batch, noise: float, generator: torch.Generator
 ) -> Losses:
     """The prior's loss as `total`, and what it has learned, with `noise` on proportions, in their spreads.
 
     `log_density` is that of true positions [nat], `preferred` the share of pairs of a true and a random rotation in which the
     true one has the higher score.
     """
-    rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
+    rows = batch.proportions
     hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
-    obj, other, position = (torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position"))
-    density, score = prior.log_density(obj, hand, position)
-    other_score = prior(other, hand)[3]
+    density, score = prior.log_density(batch.obj_hand, hand, batch.position)
+    other_score = prior(batch.obj_random, hand)[3]
     preferred = (score[:, None] > other_score).float().mean()
     return {"total": losses.placement_loss(density, score, other_score), "log_density": density.mean(), "preferred": preferred}

@@ -43,12 +43,15 @@ def pretrain(
     run = TrainingRun(folder, encoder, config.schedule, generator, processes, plan)
     encoder.train()
 
-    def losses() -> Losses:
-        return {"total": contrastive_step(encoder, source, config, generator)}
+    def draw(generator: torch.Generator) -> Clouds:
+        return posture_clouds(source, config, generator)
 
-    run.train(losses, report or console_report("pretraining"))
+    def losses(clouds: Clouds) -> Losses:
+        return {"total": contrastive_step(encoder, clouds, config)}
+
+    run.train(losses, report or console_report("pretraining"), draw)
     run.seed_shard()
-    recalibrate(encoder, losses, config.schedule.recalibration)
+    recalibrate(encoder, lambda: losses(draw(generator)), config.schedule.recalibration)
     return whole.cpu().eval()
 
 
@@ -71,17 +74,33 @@ def pretrain_motion(
     plan = run_plan(config, bundle, model.config)
     run = TrainingRun(folder, motion, config.schedule, generator, processes, plan)
     motion.train()
-    run.train(lambda: motion_losses(motion, encoder, source, config, generator), report or console_report("motion"))
+
+    def draw(generator: torch.Generator) -> Clouds:
+        return motion_clouds(source, config, generator)
+
+    def losses(clouds: Clouds) -> Losses:
+        return motion_losses(motion, encoder, clouds, config, generator)
+
+    run.train(losses, report or console_report("motion"), draw)
     return model.cpu().eval()
 
 
-def motion_losses(
-    motion: HandMotion, encoder: StaticGraphEncoder, source: SampleSource, config: MotionConfig, generator: torch.Generator
-) -> Losses:
-    """Mean distance between moved points and their targets [m], and the divergence [nat]."""
+Clouds = tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]  # Of the same hands in two postures [m]
+
+
+def motion_clouds(source: SampleSource, config: MotionConfig, generator: torch.Generator) -> Clouds:
+    """Placed open hands of one step, and what they become."""
     names = source.draw_kinematics(config.hands_per_step, generator)
     drawn = [source.draw_motions(name, config.samples_per_hand, generator) for name in names]
     hand, goal = (torch.cat(clouds) for clouds in zip(*drawn, strict=True))
+    return hand, goal
+
+
+def motion_losses(
+    motion: HandMotion, encoder: StaticGraphEncoder, clouds: Clouds, config: MotionConfig, generator: torch.Generator
+) -> Losses:
+    """Mean distance between moved points and their targets [m], and the divergence [nat]."""
+    hand, goal = clouds
     with torch.no_grad():
         features = encoder(hand - hand.mean(1, keepdim=True))
     mean, log_variance = motion.encode(features, hand, goal)
@@ -91,10 +110,8 @@ def motion_losses(
     return {"total": distance + config.divergence * nats, "distance": distance, "nats": nats}
 
 
-def contrastive_step(
-    encoder: StaticGraphEncoder, source: SampleSource, config: PretrainConfig, generator: torch.Generator
-) -> Float[Tensor, ""]:
-    """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation.
+def posture_clouds(source: SampleSource, config: PretrainConfig, generator: torch.Generator) -> Clouds:
+    """Hands of one step in grasps (cloud A), and open with a similar wrist rotation (cloud B), each about its mean.
 
     A network that does not know the placement gets both as in its training: the grasp as it is stored, the open hand tilted.
     """
@@ -109,7 +126,11 @@ def contrastive_step(
             opened, grasping = source.tilted(T, centre, generator), T[:, :3, :3]
         grasp_clouds.append(hand.points(joints) @ grasping.mT)
         open_clouds.append(hand.points(hand.random_open_joints(len(T), generator)) @ opened.mT)
-    a, b = (torch.cat(c) for c in (grasp_clouds, open_clouds))
-    features = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)]))
-    features_a, features_b = features.chunk(2)
+    return torch.cat(grasp_clouds), torch.cat(open_clouds)
+
+
+def contrastive_step(encoder: StaticGraphEncoder, clouds: Clouds, config: PretrainConfig) -> Float[Tensor, ""]:
+    """Loss of one batch: grasps (cloud A) against open hands (cloud B)."""
+    a, b = clouds
+    features_a, features_b = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)])).chunk(2)
     return contrastive_loss(features_a, features_b, b, config.temperature, config.sharpness).mean()

@@ -28,6 +28,7 @@ from dro_grasp.devices import fast_products, require_device
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import FOREIGN, UNTYPED, is_unread, make_folder, reason_of, replacing, set_aside
+from dro_grasp.graphs import Repeated
 from dro_grasp.kinds import flat
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.network.presets import NetworkConfig
@@ -329,6 +330,7 @@ class TrainingRun:
         self.step = 0
         self.seconds = 0.0  # spent training, over all sittings [s]
         self._clock = 0.0  # when time was last added [s]
+        self._names, self._moved = list[str](), list[nn.Parameter]()  # losses, and parameters on which they depend
         self._shard, self._ahead = 0, None if not draws_ahead(generator.device) else Ahead(
             generator, -(-schedule.shards // self.processes.count))
 
@@ -339,8 +341,17 @@ class TrainingRun:
         limit = self.schedule.minutes
         return steps if limit is None else max(steps, self.seconds / (60 * limit))
 
-    def train(self, losses: Callable[[], Losses], report: Report) -> None:
+    def train(
+        self, losses: Callable[..., Losses], report: Report, draw: Callable[[torch.Generator], Any] | None = None
+    ) -> None:
         """Make the folder or resume from its checkpoint, step until the schedule ends, and give the model the average.
+
+        Args:
+            losses: Those of one shard. What it computes follows from the samples that it is given, the model and the
+                generator alone, so that a GPU may record it once (see `Repeated`); without `draw` it is given none, and is
+                never recorded.
+            report: Called every few steps.
+            draw: Draws the samples of a shard, before any other of its random numbers.
 
         Raises:
             TrainingError: A loss or the gradient is not finite, or the folder holds the checkpoint of another run.
@@ -356,7 +367,7 @@ class TrainingRun:
         try:
             device = self.generator.device
             with fast_products(), torch.cuda.device(device) if device.type == "cuda" else nullcontext():
-                self._steps(losses, reports)
+                self._steps(self._computing(losses, draw), reports)
         finally:
             if self._ahead is not None:
                 self._ahead.close()
@@ -371,8 +382,25 @@ class TrainingRun:
     def _seed(self, step: int, shard: int) -> int:
         return (self.schedule.seed * 1_000_003 + step) * 1_009 + shard
 
-    def drawn(self, draw: Callable[[torch.Generator], Any]) -> Any:
-        """The samples of the shard that was seeded last, before any other of its random numbers."""
+    def _computing(
+        self, losses: Callable[..., Losses], draw: Callable[[torch.Generator], Any] | None
+    ) -> Callable[[], list[Float[Tensor, "..."]]]:
+        """What computes the losses of the shard that was seeded last, and their gradients."""
+        if draw is None:
+            return lambda: self._gradients(losses())
+        repeated = Repeated(lambda samples: tuple(self._gradients(losses(samples))), self.generator)
+        return lambda: list(repeated(self._drawn(draw)))
+
+    def _gradients(self, values: Losses) -> list[Float[Tensor, "..."]]:
+        """A shard's share of the losses, and of the gradient of each parameter that has one."""
+        trained = self._trained()
+        found = torch.autograd.grad(values["total"] / self.schedule.shards, trained, allow_unused=True)
+        self._names, self._moved = list(values), [p for p, g in zip(trained, found, strict=True) if g is not None]
+        shares = torch.stack([value.detach() for value in values.values()]) / self.schedule.shards
+        return [shares, *(gradient for gradient in found if gradient is not None)]
+
+    def _drawn(self, draw: Callable[[torch.Generator], Any]) -> Any:
+        """The samples of the shard that was seeded last."""
         if self._ahead is None:
             return draw(self.generator)
         step, shard = self.step, self._shard + self.processes.count
@@ -402,12 +430,12 @@ class TrainingRun:
         if self.processes.first:
             self.folder.cut_log(self.step)
 
-    def _steps(self, losses: Callable[[], Losses], reports: list[Report]) -> None:
+    def _steps(self, computed: Callable[[], list[Float[Tensor, "..."]]], reports: list[Report]) -> None:
         sums: dict[str, float] = {}
         counted, saved = 0, time.monotonic()
         self._clock = saved
         while self.progress < 1:
-            for name, value in self._step(losses).items():
+            for name, value in self._step(computed).items():
                 sums[name] = sums.get(name, 0.0) + value
             counted += 1
             if self.step % self.schedule.log_every == 0 or self.progress >= 1:
@@ -418,26 +446,24 @@ class TrainingRun:
                 self.save()
                 saved = time.monotonic()
 
-    def _step(self, losses: Callable[[], Losses]) -> dict[str, float]:
+    def _step(self, computed: Callable[[], list[Float[Tensor, "..."]]]) -> dict[str, float]:
         """One step of the optimiser; returns the losses before it, mean over the shards of all processes."""
         for group in self.optimiser.param_groups:
             group["lr"] = self.schedule.learning_rate * learning_rate_share(self.step, self.progress, self.schedule)
-        self.optimiser.zero_grad(set_to_none=True)
-        names: list[str] = []
-        sums: Tensor | None = None
+        sums = list[Tensor]()
         for shard in range(self.processes.rank, self.schedule.shards, self.processes.count):
             self.seed_shard(shard)
-            values = losses()
-            (values["total"] / self.schedule.shards).backward()
-            shares = torch.stack([value.detach() for value in values.values()]) / self.schedule.shards
-            names, sums = list(values), shares if sums is None else sums + shares
-        assert sums is not None
-        gradients = [p.grad for p in self._trained() if p.grad is not None]
+            values = computed()
+            sums = [a + b for a, b in zip(sums, values, strict=True)] if sums else values
+        losses, *gradients = sums
         elapsed = self._elapsed()
-        self.processes.add_up([sums, elapsed, *gradients])
+        self.processes.add_up([losses, elapsed, *gradients])
+        self.optimiser.zero_grad(set_to_none=True)
+        for parameter, gradient in zip(self._moved, gradients, strict=True):
+            parameter.grad = gradient
         norm = nn.utils.clip_grad_norm_(self._trained(), self.schedule.gradient_norm)
-        *found, size, seconds = torch.cat([sums, norm.detach()[None], elapsed]).tolist()
-        means = dict(zip(names, found, strict=True))
+        *found, size, seconds = torch.cat([losses, norm.detach()[None], elapsed]).tolist()
+        means = dict(zip(self._names, found, strict=True))
         self._check(means)
         self._check({"gradient": size})
         self.optimiser.step()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,8 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dro_grasp.distance_matrix import Segments, segments_of
+from dro_grasp import graphs
+from dro_grasp.distance_matrix import Segments, segments_of, together
 from dro_grasp.errors import BundleError
+from dro_grasp.geometry.multilateration import THIN, thin_rows
 from dro_grasp.geometry.point_clouds import nearer_half
 from dro_grasp.geometry.se3 import apply, compose, invert, random_rotations, roma, rotate
 from dro_grasp.hands.hand import Hand
@@ -41,6 +44,38 @@ class HandSamples:
 
 
 @dataclass(frozen=True)
+class Batch:
+    """Samples of several hands, as tensors alone; fields are those of `HandSamples`."""
+
+    placed: Float[Tensor, "b n 3"]
+    grasp: Float[Tensor, "b n 3"]
+    obj: Float[Tensor, "b m 3"]
+    normals: Float[Tensor, "b m 3"]
+    local: Float[Tensor, "b n 3"]  # the hands' points in the frames of their links [m]
+    segments: Segments
+    T_frame_link: Float[Tensor, "b l 4 4"]  # true poses of the segments' links
+    obj_hand: Float[Tensor, "b m 3"]
+    obj_random: Float[Tensor, "b m 3"]
+    position: Float[Tensor, "b 3"]
+    proportions: Float[Tensor, "b f"]
+    thin: Int[Tensor, " k"] | None = None
+    """Rows among which all thin clouds are, where a device would have to be waited for to find them."""
+
+    @classmethod
+    def of(cls, groups: Sequence[HandSamples], thin: Int[Tensor, " k"] | None = None) -> Batch:
+        """The samples of some hands, one after the other."""
+        def joined(name: str) -> Float[Tensor, "b ..."]:
+            return torch.cat([getattr(group, name) for group in groups])
+
+        return cls(
+            **{name: joined(name) for name in ("placed", "grasp", "obj", "normals", "obj_hand", "obj_random", "position")},
+            local=torch.cat([group.hand.link_points.expand(len(group.placed), -1, -1) for group in groups]),
+            segments=together([group.segments for group in groups]),
+            T_frame_link=torch.cat([group.T_frame_link[:, group.segments.links[0]] for group in groups]),
+            proportions=torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups]), thin=thin)
+
+
+@dataclass(frozen=True)
 class _Numbers:
     """Random numbers of samples, and constants of their hands; those of several hands are joined."""
 
@@ -56,6 +91,9 @@ class _Numbers:
     axes: Float[Tensor, "b 3 3"]  # the network's axes in the wrist frame
     grasp_centre: Float[Tensor, "b 3"]  # in the wrist frame [m]
     quaternion: Float[Tensor, "b 4"]
+
+
+NEARLY = 2.0  # Objects this many times as thick as a thin cloud may be thin as they are drawn. Source: ours
 
 
 class SampleSource:
@@ -77,6 +115,9 @@ class SampleSource:
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
         self.centres = self.points.mean(1)
+        spread = torch.linalg.eigvalsh(torch.stack([torch.cov(cloud.T) for cloud in self.points.cpu()]))[:, 0]
+        thin = (spread < (NEARLY * THIN) ** 2).float()
+        self.thin_share = max(float(thin[self.grasps[name].object_index.cpu()].mean()) for name in self.names)
 
     def draw_hands(self, count: int, generator: torch.Generator, by_count: float = 0.0) -> list[str]:
         """Names of the hands of one step; none comes twice where there are enough.
@@ -96,6 +137,20 @@ class SampleSource:
         extra = count // 2 if self.without else 0
         order = torch.randperm(len(self.without), generator=generator, device=generator.device).tolist() if extra else []
         return self.draw_hands(count - extra, generator) + [self.without[order[i % len(order)]] for i in range(extra)]
+
+    def draw_batch(
+        self, hands: int, count: int, by_count: float, columns: int | None, generator: torch.Generator
+    ) -> Batch:
+        """So many samples of each of the hands of one step, whose first object points `columns` are decoded, if any are."""
+        groups, thin = self.draw_all(self.draw_hands(hands, generator, by_count), count, generator), None
+        if columns is not None and graphs.captures(generator.device):
+            thin = thin_rows(torch.cat([group.obj[:, :columns] for group in groups]), self.thin_room(hands * count))
+        return Batch.of(groups, thin)
+
+    def thin_room(self, count: int) -> int:
+        """How many of so many samples are of thin objects at most: four standard deviations more than are expected."""
+        expected = self.thin_share * count
+        return min(count, math.ceil(expected + 4 * math.sqrt(expected)))
 
     def draw_postures(
         self, name: str, count: int, generator: torch.Generator

@@ -21,9 +21,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import Rows, repeat, where_any
+from dro_grasp.devices import Rows, where_any
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply, compose, invert, roma, rotate
+from dro_grasp.graphs import repeat
 from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 from dro_grasp.kinds import Checked
 
