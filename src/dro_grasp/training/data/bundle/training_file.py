@@ -36,7 +36,8 @@ HELD_OUT_HANDS = frozenset(f"assets/{name}" for name in ("inspire", "ability", "
 """Hands that no shipped weights were trained on, for zero-shot and few-shot results. Ours."""
 FEW_SHOT = "few_shot"
 """Split of a held-out hand's grasps on training objects: for fine-tuning studies, never for shipped weights."""
-TRAINING = frozenset({"train", ""})  # Splits of a training bundle; the empty one stands for an object of the user's own
+TRAINING = frozenset({"train", "hard_train", ""})
+"""Splits of a training bundle; the empty one stands for an object of the user's own."""
 SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT}), "validate": frozenset({"validate"})}
 """Splits that a bundle may hold, by the bundle's own split."""
 

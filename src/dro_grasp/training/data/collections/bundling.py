@@ -71,7 +71,7 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
         return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tests others"
     counts = ", ".join(f"{number} of split '{name}'" for name, number in sorted(seen.items()))
     fitting = sorted(name for name, allowed in SPLITS.items() if allowed & set(seen))
-    advice = f"choose split='{' or '.join(fitting)}'" if fitting else "grasps on test and hard objects are never bundled"
+    advice = f"choose split='{' or '.join(fitting)}'" if fitting else "grasps on objects for tests are never bundled"
     where = "hands and objects for training" if split == "train" else f"hands and objects of split '{split}'"
     return f"no grasps of split '{split}' were given, but {counts}; {advice}, or make grasps of {where} (`dro-grasp objects`)"
 
