@@ -259,6 +259,7 @@ def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
     ("obj", "table", "reason", "said"),
     [(SEEN_ON_A_TABLE, None, PLANE, "state the table's height if it is lower than the one found in the cloud"),
      (SEEN_ON_A_TABLE, -0.3, PLANE, "lower table (now -0.3 m"),
+     (SEEN_ON_A_TABLE, -9.1e-06, PLANE, "lower table (now 0 m"),
      (SEEN_ON_A_TABLE, None, TURNED, "Try another seed")])
 def test_a_table_is_named_where_it_was_given_or_found(obj: ObjectModel, table: float | None, reason: str, said: str) -> None:
     problem = GraspProblem(toy_hand(), obj, constraints=Constraints(table=table))

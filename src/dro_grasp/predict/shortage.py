@@ -95,18 +95,23 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
     """Which constraints to relax."""
     constraints, low, high = problem.constraints, *problem.height_range
     steps = {
-        "table": f"lower table (now {constraints.table} m; the object spans z = {low:.3f} to {high:.3f} m)",
-        "max_tilt": f"widen max_tilt (now {constraints.max_tilt} rad)",
+        "table": f"lower table (now {_short(constraints.table)} m; the object spans z = {low:.3f} to {high:.3f} m)",
+        "max_tilt": f"widen max_tilt (now {_short(constraints.max_tilt)} rad)",
         "direction": "leave out direction, or give another one",
         "obstacles": "check that obstacles is in the object's frame, and leave out what may be touched",
         "contact_region": "enlarge the balls of contact_region",
         "keep_out": "make the balls of keep_out smaller",
-        "pregrasp_clearance": f"ask for less pregrasp_clearance (now {constraints.pregrasp_clearance} m)",
+        "pregrasp_clearance": f"ask for less pregrasp_clearance (now {_short(constraints.pregrasp_clearance)} m)",
     }
     given = [words for name, words in steps.items() if getattr(constraints, name) not in (None, ())]
     if constraints.table is None and dropped.get(PLANE):
         given.append("state the table's height if it is lower than the one found in the cloud")
     return given
+
+
+def _short(value: float | None) -> str:
+    """A length or an angle to a thousandth."""
+    return "not given" if value is None else f"{round(float(value), 3) + 0.0:g}"
 
 
 def find_misfits(problem: GraspProblem) -> Iterator[Misfit]:
