@@ -217,7 +217,7 @@ def _place_wrist(
     T_wrist_link = hand.tree.forward(q)
     points = apply(T_wrist_link[..., wanted.links, :, :], wanted.local)
     if bool(link_poses.valid[hand.palm]):
-        T = link_poses.T_world_link[..., hand.palm, :, :] @ torch.linalg.inv(T_wrist_link[..., hand.palm, :, :])
+        T = link_poses.T_world_link[..., hand.palm, :, :] @ torch.linalg.inv_ex(T_wrist_link[..., hand.palm, :, :]).inverse
     else:
         T, _ = register(points, wanted.positions)
     return T, (apply_to_cloud(T, points) - wanted.positions).norm(dim=-1).mean(-1)

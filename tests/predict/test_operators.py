@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from dro_grasp import graphs
 from dro_grasp.geometry.contact_forces import nonnegative_least_squares
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.joint_solver import Targets, solve_joints

@@ -301,7 +301,7 @@ class RequestQueue:
         except (ProcessExpired, BrokenProcessPool, RuntimeError, DroGraspError) as error:
             if self._stops(error):
                 return STOPPED, False
-            if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGKILL and not again:
+            if _was_killed(error) and not again:
                 self._end()
                 return self._computed(request, again=True)
             return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"the process died over this request ({type(error).__name__}: "
@@ -332,3 +332,9 @@ class RequestQueue:
         """End the process, whatever it does."""
         self._pool.stop()
         self._pool.join()
+
+
+def _was_killed(error: BaseException) -> bool:
+    """Whether a process was ended from outside; the code with which it ended may not be known yet."""
+    return isinstance(error, BrokenProcessPool) or (
+        isinstance(error, ProcessExpired) and error.exitcode in (None, -signal.SIGKILL))

@@ -120,7 +120,7 @@ def _independent(
     rows = tree.coupling[known]
     matrix = rows.T @ rows + RIDGE * torch.eye(tree.n_dof, dtype=q.dtype, device=q.device)
     right = (x - tree.offset)[..., known] @ rows + RIDGE * q
-    fitted = torch.linalg.solve(matrix, right[..., None])[..., 0]
+    fitted = torch.linalg.solve_ex(matrix, right[..., None]).result[..., 0]
     return fitted.clamp(tree.lower, tree.upper)
 
 
