@@ -100,9 +100,11 @@ def recorded(
             finally:
                 graph.capture_end()
     except RuntimeError:
-        return None
-    torch.cuda.current_stream(device).wait_stream(stream)
-    return graph.replay
+        replay = None
+    else:
+        replay = graph.replay
+    torch.cuda.current_stream(device).wait_stream(stream)  # in any case for what `warm` did
+    return replay
 
 
 @cache

@@ -111,7 +111,7 @@ def motion_losses(
 
 
 def posture_clouds(source: SampleSource, config: PretrainConfig, generator: torch.Generator) -> Clouds:
-    """Hands of one step in grasps (cloud A), and open with a similar wrist rotation (cloud B), each about its mean.
+    """Hands of one step in grasps (cloud A), and open with a similar wrist rotation (cloud B).
 
     A network that does not know the placement gets both as in its training: the grasp as it is stored, the open hand tilted.
     """
