@@ -20,6 +20,7 @@ from dro_grasp.arm.motion import SLIDING, MotionPlan
 from dro_grasp.arm.physics import LiftScene
 from dro_grasp.arm.postures import AHEAD, OVER, WorkingHand, flat_grips
 from dro_grasp.arm.robot import Robot, Table
+from dro_grasp.arm.robot_loading import load_robot
 from dro_grasp.arm.sliding import SlideConfig, pushes, slide
 from dro_grasp.arm.tabletop import TabletopConfig, attempt, carry_out
 from dro_grasp.arm.workcell import Workcell
@@ -243,6 +244,26 @@ def test_nothing_is_pushed_through_other_things(narrow: Robot) -> None:
         slide(narrow, thing, walls)
     with pytest.raises(PlanError, match="has no table; state its centre and size"):
         slide(replace(narrow, table=None), thing)
+
+
+def test_nothing_is_pushed_to_where_the_camera_does_not_look(narrow: Robot) -> None:
+    thing = board((0.11, 0.09, 0.005), (0.4, -0.1), 0.3)
+    assert narrow.camera is not None
+    aside = replace(narrow.camera, T_world_camera=narrow.camera.T_world_camera + np.array([[0.0, 0, 0, 2]] + [[0] * 4] * 3))
+    with pytest.raises(PlanError, match="no edge of the table at which the camera would see it: .* turn the camera"):
+        slide(replace(narrow, camera=aside), thing)
+    assert slide(replace(narrow, camera=None), thing).notes.slide is not None
+
+
+@pytest.mark.parametrize("name", ["ur5e_allegro", "xarm7_leaphand"])
+def test_cameras_of_built_in_robots_see_what_overhangs_beside_the_arm(name: str) -> None:
+    robot = load_robot(name)
+    camera, table = robot.camera, robot.table
+    assert camera is not None and table is not None
+    edge = table.centre[0] - table.size[0] / 2
+    there = np.array([[edge - SlideConfig().most - 0.03, y, table.height, 1.0] for y in (-0.4, 0.4)])
+    u, v, z = camera.intrinsics @ (np.linalg.inv(camera.T_world_camera) @ there.T)[:3]
+    assert (z > 0).all() and (v > 0).all() and (v < camera.height * z).all() and (u > 0).all() and (u < camera.width * z).all()
 
 
 def test_what_overhangs_is_lifted(narrow: Robot) -> None:

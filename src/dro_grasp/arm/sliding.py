@@ -32,6 +32,7 @@ AT_TABLE = ReachConfig(table_margin=-0.002, clearance=0.0, deepest=0.05)
 
 LOWEST = 0.004  # Height of the part of a fingertip that meets what is lower [m] (ours)
 SHORTEST = 0.006  # Shorter pushes are none [m] (ours)
+SEEN = 0.98  # Share of a thing that the camera sees at the edge, at least [1] (ours)
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,14 @@ def slide(
         raise PlanError(f"'{obj.name}' cannot be pushed to an edge: robot '{robot.name}' has no table; state its centre and "
                         "size in the robot file")
     pusher = _Pusher(robot, obj, obstacles, config, seed, robot.home if start is None else start)
+    unseen = 0
     for push in pushes(np.asarray(obj.cloud, np.float64), obj.centre_of_mass, table, config):
-        if not pusher.is_free(push) or not pusher.can_take(push):
+        if not pusher.is_free(push):
+            continue
+        if not pusher.is_seen(push):
+            unseen += 1
+            continue
+        if not pusher.can_take(push):
             continue
         for line in pusher.lines(push):
             if (made := pusher.motion(push, line)) is not None and pusher.is_safe(made):
@@ -165,6 +172,10 @@ def slide(
     if pusher.unsafe:
         raise PlanError(f"'{obj.name}' lies flat, and falls off the table in all {pusher.unsafe} pushes to an edge that were "
                         "simulated; move it nearer to the robot, or to another edge")
+    if unseen:
+        raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table at which the camera would see it: "
+                        f"{unseen} pushes end outside of its image; turn the camera so that it sees an edge beside the arm, and "
+                        "correct its pose in the robot file")
     raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table to which it could be pushed; move it "
                     "nearer to an edge that the robot reaches around, or correct the table's centre and size in the robot file")
 
@@ -204,6 +215,16 @@ class _Pusher:
         along = things @ push.direction
         inside = (np.abs(things @ across - middle) < half) & (along > rear - self.config.behind - 0.03) & (along < front)
         return not inside.any()
+
+    def is_seen(self, push: Push) -> bool:
+        """Whether the robot's camera, if it has one, will see the thing at the edge: planning goes on from what it sees."""
+        if (camera := self.robot.camera) is None:
+            return True
+        ends = self.points @ push.motion[:3, :3].T + push.motion[:3, 3]
+        T, size = camera.T_world_camera, np.array([camera.width, camera.height])
+        image = (ends - T[:3, 3]) @ T[:3, :3] @ camera.intrinsics.T
+        pixels = image[:, :2] / image[:, 2:]
+        return bool(((image[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)).mean() > SEEN)
 
     def can_take(self, push: Push) -> bool:
         """Whether the arm reaches a grasp of the thing where it will be."""
