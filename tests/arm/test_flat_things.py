@@ -85,6 +85,20 @@ def test_an_outline_with_a_corner_keeps_it() -> None:
     assert obj.volume == pytest.approx(0.004 * area, rel=0.15)
 
 
+def test_a_thing_far_from_the_camera_keeps_what_overhangs() -> None:
+    """Pixels that meet it at a glancing angle are 5 to 9 mm apart; stray ones beside it are left out."""
+    draw = np.random.default_rng(4)
+    rows = -0.05 - np.cumsum(np.linspace(0.005, 0.009, 26))
+    x, y = np.meshgrid(rows, np.arange(-0.07, 0.07, 0.005))
+    flat = np.column_stack([x.ravel(), y.ravel()]) + draw.normal(0, 0.001, (x.size, 2))
+    stray = [[rows.min() - 0.04, 0.0], [rows.min() - 0.05, 0.05], [0.0, 0.03]]
+    points = np.column_stack([np.concatenate([flat, stray]), np.full(x.size + 3, TABLE.height + 0.01)])
+    obj = flat_object("board", points, EYE, TABLE.height)
+    assert obj.vertices is not None
+    assert np.allclose(obj.vertices[:, :2].min(0), flat.min(0), atol=0.004)
+    assert np.allclose(obj.vertices[:, :2].max(0), flat.max(0), atol=0.004)
+
+
 def test_what_is_seen_flat(narrow: Robot) -> None:
     """Table and card, and a can beside it, which is not flat."""
     draw = np.random.default_rng(3)

@@ -26,6 +26,7 @@ LOW = 0.035  # Height up to which a thing counts as flat [m] (ours), as `predict
 THINNEST = 0.001  # Height that a thing has at least [m] (ours): a card has 0.8 mm
 TOP = 0.85  # Share of the points of a part that its top is above [1] (ours)
 BESIDE = 0.008  # A point with fewer than NEIGHBOURS others within this distance is noise [m] (ours)
+SPACINGS = 2.0  # The same in usual distances to as many neighbours [1] (ours): pixels at a glancing angle are far apart
 NEIGHBOURS = 3  # Fewest others there of a point that is none (ours)
 SAME = 0.003  # Points at most this far from the plane are the table's [m] (ours)
 ABOVE = 0.006  # Height from which on what is seen counts as another thing [m] (ours)
@@ -111,11 +112,14 @@ def flat_object(
     top = table + max(THINNEST, float(np.median(points[:, 2])) - table)
     share = (eye[2] - top) / (eye[2] - points[:, 2])
     outline = (eye + share[:, None] * (points - eye))[:, :2]
-    kept = np.array([len(near) > NEIGHBOURS for near in KDTree(outline).query_ball_point(outline, BESIDE)], bool)
+    spacing = KDTree(outline).query(outline, NEIGHBOURS + 1)[0][:, -1]
+    kept = spacing < max(BESIDE, SPACINGS * float(np.median(spacing)))
     if kept.sum() < FEWEST:
         kept[:] = True
     outline, height = outline[kept], points[kept, 2] - table
     pieces = [_prism(outline[rows], height[rows], table) for rows in _strips(outline)]
+    if not all(piece.is_volume for piece in pieces):  # slivers
+        pieces = [_prism(outline, height, table)]
     corners, sides, first = [], [], 0
     for piece in pieces:
         corners.append(piece.vertices)
