@@ -86,9 +86,9 @@ def test_an_outline_with_a_corner_keeps_it() -> None:
 
 
 def test_a_thing_far_from_the_camera_keeps_what_overhangs() -> None:
-    """Pixels that meet it at a glancing angle are 5 to 9 mm apart; stray ones beside it are left out."""
+    """Pixels that meet it at a glancing angle are 6 to 12 mm apart; stray ones beside it are left out."""
     draw = np.random.default_rng(4)
-    rows = -0.05 - np.cumsum(np.linspace(0.005, 0.009, 26))
+    rows = -0.05 - np.cumsum(np.linspace(0.006, 0.012, 18))
     x, y = np.meshgrid(rows, np.arange(-0.07, 0.07, 0.005))
     flat = np.column_stack([x.ravel(), y.ravel()]) + draw.normal(0, 0.001, (x.size, 2))
     stray = [[rows.min() - 0.04, 0.0], [rows.min() - 0.05, 0.05], [0.0, 0.03]]
@@ -264,7 +264,7 @@ def test_nothing_is_pushed_to_where_the_camera_does_not_look(narrow: Robot) -> N
     thing = board((0.11, 0.09, 0.005), (0.4, -0.1), 0.3)
     assert narrow.camera is not None
     aside = replace(narrow.camera, T_world_camera=narrow.camera.T_world_camera + np.array([[0.0, 0, 0, 2]] + [[0] * 4] * 3))
-    with pytest.raises(PlanError, match="no edge of the table at which the camera would see it: .* turn the camera"):
+    with pytest.raises(PlanError, match=r"no edge of the table at which the camera would see it: .* turn the camera"):
         slide(replace(narrow, camera=aside), thing)
     assert slide(replace(narrow, camera=None), thing).notes.slide is not None
 
@@ -273,11 +273,15 @@ def test_nothing_is_pushed_to_where_the_camera_does_not_look(narrow: Robot) -> N
 def test_cameras_of_built_in_robots_see_what_overhangs_beside_the_arm(name: str) -> None:
     robot = load_robot(name)
     camera, table = robot.camera, robot.table
-    assert camera is not None and table is not None
+    assert camera is not None
+    assert table is not None
     edge = table.centre[0] - table.size[0] / 2
     there = np.array([[edge - SlideConfig().most - 0.03, y, table.height, 1.0] for y in (-0.4, 0.4)])
     u, v, z = camera.intrinsics @ (np.linalg.inv(camera.T_world_camera) @ there.T)[:3]
-    assert (z > 0).all() and (v > 0).all() and (v < camera.height * z).all() and (u > 0).all() and (u < camera.width * z).all()
+    assert (z > 0).all()
+    assert (np.array([u, v]) > 0).all()
+    assert (u < camera.width * z).all()
+    assert (v < camera.height * z).all()
 
 
 def test_what_overhangs_is_lifted(narrow: Robot) -> None:

@@ -174,8 +174,8 @@ def slide(
                         "simulated; move it nearer to the robot, or to another edge")
     if unseen:
         raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table at which the camera would see it: "
-                        f"{unseen} pushes end outside of its image; turn the camera so that it sees an edge beside the arm, and "
-                        "correct its pose in the robot file")
+                        f"{unseen} pushes end outside of its image; turn the camera so that it sees an edge beside the arm, "
+                        "and correct its pose in the robot file")
     raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table to which it could be pushed; move it "
                     "nearer to an edge that the robot reaches around, or correct the table's centre and size in the robot file")
 
