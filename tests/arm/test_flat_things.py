@@ -89,8 +89,8 @@ def test_a_thing_far_from_the_camera_keeps_what_overhangs() -> None:
     """Pixels that meet it at a glancing angle are 6 to 12 mm apart; stray ones beside it are left out."""
     draw = np.random.default_rng(4)
     rows = -0.05 - np.cumsum(np.linspace(0.006, 0.012, 18))
-    x, y = np.meshgrid(rows, np.arange(-0.07, 0.07, 0.005))
-    flat = np.column_stack([x.ravel(), y.ravel()]) + draw.normal(0, 0.001, (x.size, 2))
+    x, y = np.meshgrid(rows, np.arange(-0.07, 0.07, 0.0065))
+    flat = np.column_stack([x.ravel(), y.ravel()]) + draw.normal(0, 0.0005, (x.size, 2))
     stray = [[rows.min() - 0.04, 0.0], [rows.min() - 0.05, 0.05], [0.0, 0.03]]
     points = np.column_stack([np.concatenate([flat, stray]), np.full(x.size + 3, TABLE.height + 0.01)])
     obj = flat_object("board", points, EYE, TABLE.height)
