@@ -13,7 +13,7 @@ import torch
 import yaml
 
 import dro_grasp as dro
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.robot import CameraMount, Robot
 from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS, load_robot, robot_names
 from dro_grasp.arm.workcell import Workcell
 from dro_grasp.cli.main import main
@@ -202,12 +202,23 @@ def test_an_arm_without_position_limits_needs_them_in_the_file(values: dict[str,
     assert load_robot(written(values, tmp_path)).lower[0] == -3.0
 
 
+def test_a_camera_frames_what_its_angles_of_view_hold() -> None:
+    """One that looks straight down from 2 m, 320 pixels at a focal length of 160: a metre shows as 80 pixels."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = 0.5, 0.0, 2.0
+    camera = CameraMount(T, np.array([[160.0, 0, 160], [0, 160, 80], [0, 0, 1]]), 320, 160)
+    places = np.array([[0.5, 0, 0], [2.4, 0, 0], [2.6, 0, 0], [-1.4, 0.9, 0], [0.5, 1.1, 0], [0.5, -1.1, 0], [0.5, 0, 2.5],
+                       [2.4, 0, 1]])
+    assert camera.frames(places).tolist() == [True, True, False, True, False, False, False, False]
+
+
 def test_the_check_says_what_it_found_and_draws_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "robot.png"
     assert main(["robot", "check", "xarm7_leaphand", "--picture", str(picture)]) == 0
     said = capsys.readouterr().out
     assert "7 arm joints, hand leaphand with 16" in said
     assert "reach" in said
+    assert "it shows the edge x = -0.15 of the table" in said
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dro_grasp.arm.drivers import Drivers
 from dro_grasp.errors import OptionError
@@ -35,6 +35,14 @@ class CameraMount:
     def as_seen(self) -> SceneCamera:
         """The camera for `load_scene`."""
         return SceneCamera(self.T_world_camera, self.intrinsics, "world")
+
+    def frames(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which places of the world [m] are within its image; other things may hide them."""
+        T, size = self.T_world_camera, np.array([self.width, self.height])
+        image = (points - T[:3, 3]) @ T[:3, :3] @ self.intrinsics.T
+        ahead = image[:, 2] > 0
+        pixels = image[:, :2] / np.where(ahead, image[:, 2], 1.0)[:, None]
+        return np.asarray(ahead & (pixels >= 0).all(1) & (pixels < size).all(1))
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from dro_grasp.arm.robot import Robot, Table
+from dro_grasp.arm.robot import CameraMount, Robot, Table
 from dro_grasp.arm.robot_loading import load_robot
+from dro_grasp.arm.sliding import SlideConfig
 from dro_grasp.arm.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour, Mesh, arrow, render
@@ -21,6 +22,7 @@ from dro_grasp.hands.description.loader import Description
 from dro_grasp.simulation.scene import PREFIX
 
 SIZE = (900, 660)  # Width and height of the picture [pixels]
+ALONG = 29  # Places along an edge that are looked at
 VIEW = (1.0, -1.3, 0.75)  # Direction from the robot towards the camera of pictures, in the world
 ARM_COLOUR: Colour = (0.84, 0.85, 0.87)  # Light grey of the arm
 MOUNT_COLOUR: Colour = (0.35, 0.38, 0.43)  # Dark grey of the arm's base
@@ -72,6 +74,8 @@ class RobotReport:
             f"table at z = {r.table.height:g} m, {r.table.size[0]:g} x {r.table.size[1]:g} m")
         camera = "no camera" if r.camera is None else (
             "camera at ({:.2f}, {:.2f}, {:.2f}) m".format(*r.camera.T_world_camera[:3, 3]))
+        if r.camera is not None and r.table is not None:
+            camera += f"; it shows {', '.join(shown_edges(r.camera, r.table)) or 'no edge'} of the table"
         return [
             f"robot {r.name}: {len(r.arm_joints)} arm joints, hand {r.hand.name} with {len(r.hand_joints)}, mounted at "
             f"link {r.mount_link}",
@@ -88,6 +92,19 @@ class RobotReport:
             "usable" if self.usable else "not usable: change `home` or the mount until nothing collides at home"
             if self.home_contacts else "not usable: change `table`, `base` or the mount until the arm can move",
         ]
+
+
+def shown_edges(camera: CameraMount, table: Table) -> list[str]:
+    """Edges of a table beside which an overhanging thing is within a camera's image, somewhere along them."""
+    found = []
+    for axis, sign in ((axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)):
+        edge = table.centre[axis] + sign * table.size[axis] / 2
+        points = np.full((ALONG, 3), table.height)
+        points[:, axis] = edge + sign * SlideConfig().most
+        points[:, 1 - axis] = table.centre[1 - axis] + np.linspace(-0.5, 0.5, ALONG) * table.size[1 - axis]
+        if camera.frames(points).any():
+            found.append(f"the edge {'xy'[axis]} = {edge:g}")
+    return found
 
 
 def check_robot(name: str | Path) -> RobotReport:

@@ -218,13 +218,8 @@ class _Pusher:
 
     def is_seen(self, push: Push) -> bool:
         """Whether the robot's camera, if it has one, will see the thing at the edge: planning goes on from what it sees."""
-        if (camera := self.robot.camera) is None:
-            return True
         ends = self.points @ push.motion[:3, :3].T + push.motion[:3, 3]
-        T, size = camera.T_world_camera, np.array([camera.width, camera.height])
-        image = (ends - T[:3, 3]) @ T[:3, :3] @ camera.intrinsics.T
-        pixels = image[:, :2] / image[:, 2:]
-        return bool(((image[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)).mean() > SEEN)
+        return self.robot.camera is None or float(self.robot.camera.frames(ends).mean()) > SEEN
 
     def can_take(self, push: Push) -> bool:
         """Whether the arm reaches a grasp of the thing where it will be."""
