@@ -163,6 +163,15 @@ def test_round_tips_hold_no_low_edges(radius: float) -> None:
     assert 1 - math.sin(math.atan(friction)) == pytest.approx(0.553, abs=1e-3)
 
 
+def test_what_overhangs_does_not_creep_over_the_edge() -> None:
+    config, table = SlideConfig(), Table(0.0, (0.45, 0.0), (1.2, 0.6))
+    for place, some in ((0.2575, True), (0.2775, False)):  # the board overhangs by 1 cm, which is pushed on, and by 3
+        thing = board((0.11, 0.11, 0.005), (0.45, place), 0.0)
+        ahead = [p for p in pushes(np.asarray(thing.cloud, float), thing.centre_of_mass, table, config)
+                 if p.direction[1] > 0.99]
+        assert bool(ahead) == some
+
+
 def test_pushes_bring_things_to_overhang() -> None:
     config, table = SlideConfig(), Table(0.0, (0.45, 0.0), (1.2, 0.6))
     card = board((0.09, 0.06, 0.002), (0.45, 0.1), 0.4)

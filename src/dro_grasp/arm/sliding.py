@@ -32,6 +32,7 @@ AT_TABLE = ReachConfig(table_margin=-0.002, clearance=0.0, deepest=0.05)
 
 LOWEST = 0.004  # Height of the part of a fingertip that meets what is lower [m] (ours)
 SHORTEST = 0.006  # Shorter pushes are none [m] (ours)
+FURTHER = 0.02  # The same for what overhangs already: small ones would creep over the edge [m] (ours)
 SEEN = 0.98  # Share of a thing that the camera sees at the edge, at least [1] (ours)
 
 
@@ -112,7 +113,8 @@ def pushes(
         T[:3, 3] += length * direction
         ends = turned + length * direction
         aside = np.abs(ends[:, 1 - axis] - table.centre[1 - axis]) - table.size[1 - axis] / 2
-        if wanted >= LEAST_OVERHANG and length > SHORTEST and float(aside.max()) < -0.02:
+        least = FURTHER if float((points @ normal).max()) - edge >= LEAST_OVERHANG else SHORTEST
+        if wanted >= LEAST_OVERHANG and length > least and float(aside.max()) < -0.02:
             found.append((length + config.turning * abs(turn), Push(direction, length, T)))
     return [push for _, push in sorted(found, key=lambda each: each[0])]
 
