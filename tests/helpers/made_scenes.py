@@ -156,14 +156,14 @@ def touching(seed: int) -> MadeScene:
     return render_scene("table", meshes, names, rng, seed % 3)
 
 
-def asked(made: MadeScene) -> list[float]:
+def asked(made: MadeScene, part: bool = False) -> list[float]:
     """How much of each object that shows 400 pixels is found by a place in it: intersection over union; 0 for an error."""
     scene, found = made.load(), []
     for k, middle in enumerate(made.middles):
         if (made.owner == k).sum() < 400:
             continue
         try:
-            found.append(overlap(made, k, scene.chosen(at=tuple(middle)).pixels))
+            found.append(overlap(made, k, scene.chosen(at=tuple(middle), part=part).pixels))
         except ObjectError as error:
             print(f"   {made.names[k]}: {error}")
             found.append(0.0)
@@ -180,17 +180,19 @@ def told(found: list[float]) -> str:
 
 def main() -> None:
     """Measure 24 scenes of up to six objects that stand apart, and 48 of two that touch."""
-    apart: list[float] = []
+    apart, parts = list[float](), list[float]()
     for seed in range(24):
         place: Place = ("table", "shelf", "bin")[seed % 3]
         made = make_scene(place, 1 + seed % 6, seed, view=(seed // 3) % 3, noise=(0.001, 0.003, 0.005)[(seed // 6) % 3])
         apart += asked(made)
+        parts += asked(made, part=True)
         begin = time.process_time()
         segments = made.load().segments
         print(f"{place} seed {seed}: {len(made.middles)} objects, {segments.count} things, {len(segments.planes)} planes, "
               f"{time.process_time() - begin:.2f} s", flush=True)
-    print(f"apart: {told(apart)}")
-    print(f"touching: {told([iou for seed in range(48) for iou in asked(touching(seed))])}")
+    print(f"apart: {told(apart)}; asked for as parts: {told(parts)}")
+    for part in (False, True):
+        print(f"touching{', as parts' * part}: {told([iou for seed in range(48) for iou in asked(touching(seed), part)])}")
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ class PickedObject:
 @checked
 def pick_object(
     scene: Scene, robot: Robot, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
-    nearest: bool = False, name: str | None = None,
+    nearest: bool = False, part: bool = False, name: str | None = None,
 ) -> PickedObject:
     """One object of what was seen of a robot's table; see `Scene.object_at`, which says how one is chosen.
 
@@ -55,6 +55,7 @@ def pick_object(
         mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG. It also shows what is too flat
             for the camera's depth, such as a card.
         nearest: Take what is nearest to the camera.
+        part: Of things that touch, take the one side at the place or the pixel; the other one is avoided.
         name: What to call it; the scene's name by default.
 
     Raises:
@@ -65,7 +66,7 @@ def pick_object(
     seen = seen_on_table(scene, robot)
     if mask is not None and (flat := picked_flat(seen, robot, mask, name)) is not None:
         return flat
-    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, name=name), robot)
+    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name), robot)
 
 
 def as_picked(found: FoundObject, robot: Robot) -> PickedObject:

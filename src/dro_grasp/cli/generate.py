@@ -53,6 +53,7 @@ class Generate:
     mask: Annotated[Path | None, optional("PNG", "the only thing")] = None
     """Which thing of the scene: the pixels that are not black in this image."""
     nearest: Flag = False  # Which thing of the scene: the one nearest to the camera.
+    part: Flag = False  # Of things that touch: the one side at --at or --pixel.
     scene_picture: Annotated[Path | None, optional("PNG", "no picture")] = None
     """Picture of what was taken for the object, for tables and walls, and for obstacles, before anything is grasped."""
     num: int = 16  # How many grasps of each object.

@@ -25,7 +25,7 @@ def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
     given = [option for option in CHOICES if getattr(command, option[2:]) not in (None, False)]
     if command.scene is None:
         concern = [option for option in given if option not in own]
-        concern += ["--scene-picture"] * (command.scene_picture is not None)
+        concern += ["--part"] * command.part + ["--scene-picture"] * (command.scene_picture is not None)
         if concern:
             raise OptionError(f"{' and '.join(concern)} concern a scene; give it by --scene instead of --object")
     elif len(given) > 1:
@@ -41,7 +41,7 @@ def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
 
     picture = command.scene_picture
     try:
-        found = scene.object_at(command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest)
+        found = scene.object_at(command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest, part=command.part)
     except ObjectError:
         if picture is not None and scene.sight is not None:
             draw_scene(scene, None, picture)

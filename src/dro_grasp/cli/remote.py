@@ -24,7 +24,7 @@ HERE = "none"  # Address that stands for no server
 TIMEOUT = 600.0  # Longest wait for a server [s] (ours); its own limit ends a request earlier
 OWN = ("weights", "device")  # Options that are the server's own
 SHOWN = ("picture", "view")  # Options that need the hand and the object here
-SCENE = ("scene", "at", "pixel", "mask", "nearest", "scene_picture")  # Options of scenes, which are taken apart here
+SCENE = ("scene", "at", "pixel", "mask", "nearest", "part", "scene_picture")  # Options of scenes, which are taken apart here
 SOURCES = ("auto", "network", "optimiser")  # What proposes candidates at a server, which runs no code of others
 FAULT = 500  # Status of HTTP after a fault of dro-grasp
 

@@ -118,17 +118,17 @@ class Scene:
         return points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
 
     def chosen(
-        self, at: Spot | None = None, pixel: Pixel | None = None, mask: Any = None, nearest: bool = False
+        self, at: Spot | None = None, pixel: Pixel | None = None, mask: Any = None, nearest: bool = False, part: bool = False
     ) -> Chosen:
         """Which points are the object's; arguments as for `object_at`."""
         segments = self.segments
         assert self.sight is not None
-        return choose(self.name, self.sight, segments, at, pixel, mask, nearest)
+        return choose(self.name, self.sight, segments, at, pixel, mask, nearest, part)
 
     @checked
     def object_at(
         self, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
-        nearest: bool = False, name: str | None = None,
+        nearest: bool = False, part: bool = False, name: str | None = None,
     ) -> FoundObject:
         """The object that is meant, completed, and all else as obstacles.
 
@@ -141,6 +141,7 @@ class Scene:
             pixel: A pixel that shows it: column and row, from the upper left.
             mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG.
             nearest: Take what is nearest to the camera.
+            part: Of things that touch, take the one side at the place or the pixel; the other one is avoided.
             name: What to call it; the scene's name by default.
 
         With none of them, the scene has to show one thing alone.
@@ -149,7 +150,7 @@ class Scene:
             ObjectError: There is no thing there, or it is not clear which is meant.
             OptionError: Two of them are given, or the scene lacks what one of them needs.
         """
-        chosen = self.chosen(at, pixel, mask, nearest)
+        chosen = self.chosen(at, pixel, mask, nearest, part)
         assert self.sight is not None
         obj = taken_object(name or self.name, self.sight, self.segments, chosen)
         others = self.sight.world()[chosen.others]

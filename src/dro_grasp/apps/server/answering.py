@@ -237,7 +237,7 @@ class Answerer:
                 mask = Path(folder) / "mask.png"
                 mask.write_bytes(choice.mask.content)
             try:
-                return scene.object_at(choice.at, pixel=choice.pixel, mask=mask, nearest=choice.nearest)
+                return scene.object_at(choice.at, pixel=choice.pixel, mask=mask, nearest=choice.nearest, part=choice.part)
             except DroGraspError as error:
                 raise type(error)(str(error).replace(f"{folder}/", "")) from error
 

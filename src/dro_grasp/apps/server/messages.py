@@ -106,6 +106,8 @@ class SentChoice(Message):
     """A pixel that shows it: column and row."""
     nearest: bool = False
     """Take the one nearest to the camera."""
+    part: bool = False
+    """Of things that touch, take the one side at the place or the pixel."""
     mask: SentFile | None = None
     """A PNG of the image's size that is not black on the object alone."""
 

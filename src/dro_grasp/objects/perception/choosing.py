@@ -75,23 +75,27 @@ class Chosen:
 
 def choose(
     name: str, sight: Sight, segments: Segments, at: Spot | None, pixel: Pixel | None, mask: Any,
-    nearest: bool,
+    nearest: bool, part: bool = False,
 ) -> Chosen:
     """The points of the thing that is meant; see `Scene.object_at`."""
     given = [way for way, said in (("at", at is not None), ("pixel", pixel is not None), ("mask", mask is not None),
                                    ("nearest", nearest)) if said]
     if len(given) > 1:
         raise OptionError(f"{' and '.join(given)} each say which object is meant; give one of them")
+    if part and at is None and pixel is None:
+        raise OptionError("part asks for one side of things that touch; say by a place (at=(X, Y, Z)) or a pixel "
+                          "(pixel=(U, V)) which")
     if mask is not None:
         own = _masked(name, sight, segments, mask)
         return _chosen(sight, segments, own, ())
     if not segments.count:
         raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
                           "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
+    side = None
     if at is not None:
-        number = _at(name, sight, segments, at)
+        number, side = _at(name, sight, segments, at)
     elif pixel is not None:
-        number = _at_pixel(name, sight, segments, pixel)
+        number, side = _at_pixel(name, sight, segments, pixel)
     elif nearest:
         number = _nearest(name, sight, segments)
     elif segments.count == 1:
@@ -100,10 +104,16 @@ def choose(
         raise ObjectError(f"'{name}' shows {segments.count} things ({listed(sight, segments)}); say which is meant: by a place "
                           "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or as the nearest to the "
                           "camera (nearest=True)")
-    own = np.flatnonzero(segments.labels == number)
-    seam = ("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If so, give "
-            "the pixels of the one that is meant (mask=PNG)",) if segments.seams[number] else ()
-    return _chosen(sight, segments, own, (*seam, *_beside(sight, segments, own)))
+    mine = segments.labels == number
+    own, notes = np.flatnonzero(mine & (segments.parts == side) if part else mine), list[str]()
+    if part and len(own) == mine.sum():
+        notes.append("no seam parts it from what it may touch, and all of it counts. If that is too much, give the pixels of "
+                     "what is meant (mask=PNG)")
+    elif not part and segments.seams[number]:
+        notes.append("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If "
+                     "so, mean the side that you point at (part=True), or give its pixels (mask=PNG)")
+    notes += _beside(sight, segments, own)
+    return _chosen(sight, segments, own, tuple(notes))
 
 
 def _beside(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
@@ -141,7 +151,8 @@ def _planes(segments: Segments) -> str:
     return f"{len(areas)} {'plane' if len(areas) == 1 else 'planes'} ({', '.join(areas)})" if areas else "no plane"
 
 
-def _at(name: str, sight: Sight, segments: Segments, at: Spot) -> int:
+def _at(name: str, sight: Sight, segments: Segments, at: Spot) -> tuple[int, int]:
+    """The thing at a place, and which part of it is nearest to the place."""
     place = numbers(at, "at").astype(np.float64)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise OptionError(f"at is {place.tolist()}; give x, y and z in metres")
@@ -154,7 +165,9 @@ def _at(name: str, sight: Sight, segments: Segments, at: Spot) -> int:
     if away[closest] > BESIDE and within is None:
         raise ObjectError(f"'{name}' shows no thing within {100 * BESIDE:.0f} cm of {place_of(place[None])}: the nearest is "
                           f"{100 * away[closest]:.0f} cm away. It shows {listed(sight, segments)}")
-    return int(labels[things[closest]]) if within is None else within
+    number = int(labels[things[closest]]) if within is None else within
+    own = np.flatnonzero(labels == number)
+    return number, int(segments.parts[own[np.linalg.norm(world[own] - place, axis=1).argmin()]])
 
 
 def _inside(
@@ -170,7 +183,8 @@ def _inside(
     return min(found)[1] if found else None
 
 
-def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> int:
+def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> tuple[int, int]:
+    """The thing that a pixel shows, and which part of it."""
     image, wanted = sight.image(), numbers(pixel, "pixel").astype(np.float64)
     if image is None:
         raise OptionError(f"a pixel is given, and '{name}' is a cloud without an image; state \"intrinsics\" in the camera's "
@@ -190,7 +204,7 @@ def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> int:
         what = {STRUCTURE: "a table, board or wall", NOTHING: "scattered points", SPECK: "something too small"}.get(
             number, "something too large or far away")
         raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}; '{name}' shows {listed(sight, segments)}")
-    return number
+    return number, int(segments.parts[closest])
 
 
 def _nearest(name: str, sight: Sight, segments: Segments) -> int:

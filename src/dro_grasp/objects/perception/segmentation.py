@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
+from dro_grasp.objects.perception.seams import Surface, joined, parted
 
 CELL = 0.004  # Edge of the cubes whose points are averaged [m] (ours): noise of single pixels goes, a finger's width stays
 NOISES = 2.0  # Standard deviations of the noise that a cube measures at least [1] (ours)
@@ -44,8 +43,6 @@ LEAST_THING = 24  # Filled cubes of a thing, at least (ours): 4 square centimetr
 LEAST_SPECK = 5  # Filled cubes of what hands avoid, at least (ours)
 LONGEST_THING = 0.6  # Longest thing that a hand may be meant to grasp [m] (ours)
 FRAGMENT = 0.015  # Scattered points nearer to a thing than this may be parts of it [m] (ours)
-CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
-PART = 0.15  # Share of a thing that both sides of a seam have, at least [1] (ours)
 NOTHING = -1  # Label of scattered points; things have numbers from 0
 STRUCTURE = -2  # Label of tables, boards and walls
 OTHER = -3  # Label of what is too large or too far away to be meant
@@ -63,7 +60,9 @@ class Segments:
     areas: tuple[float, ...]
     """Their visible areas [m^2]."""
     seams: tuple[bool, ...]
-    """For each thing, whether a seam parts it, as two things have that touch."""
+    """For each thing, whether a seam runs over it, as between two things that touch."""
+    parts: Int[np.ndarray, " n"]
+    """Of each point: which of the things that touch it may be, of those that its thing may consist of; 0 where it is one."""
 
     @property
     def count(self) -> int:
@@ -75,8 +74,7 @@ def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
     """Take a cloud apart, which the camera sees from its place [m]; without one, it was seen from all sides.
 
     Large planes come first, by sampled fits. What is left is joined by distance between points that have enough neighbours,
-    as in DBSCAN. Source: Fischler and Bolles 1981; Ester et al. 1996. Seams are found by the normals on both their sides, as
-    by Stein et al. 2014.
+    as in DBSCAN. Source: Fischler and Bolles 1981; Ester et al. 1996.
     """
     view = _View.of(points, camera)
     edge = _edge(view, points)
@@ -87,9 +85,11 @@ def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
     for plane in planes:
         owned[plane.owns(view)] = STRUCTURE
     rest = np.flatnonzero(owned == NOTHING)
-    owned[rest], seams = _things(view, rest, [plane.plane for plane in planes])
-    labels = np.where(view.cell_of >= 0, owned[view.cell_of], OTHER)
-    return Segments(labels, tuple(p.plane for p in planes), tuple(p.area for p in planes), seams)
+    parts = np.zeros(len(view.cells), int)
+    owned[rest], parts[rest], seams = _things(view, rest, [plane.plane for plane in planes])
+    seen = view.cell_of >= 0
+    return Segments(np.where(seen, owned[view.cell_of], OTHER), tuple(p.plane for p in planes), tuple(p.area for p in planes),
+                    seams, np.where(seen, parts[view.cell_of], 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,30 +281,32 @@ def _is_structure(view: _View, plane: _Plane, found: list[_Plane]) -> bool:
 
 def _things(
     view: _View, rest: Int[np.ndarray, " r"], planes: list[Float[np.ndarray, "4"]]
-) -> tuple[Int[np.ndarray, " r"], tuple[bool, ...]]:
-    """The label of each cube that is left, and whether a seam parts each thing."""
+) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], tuple[bool, ...]]:
+    """The label and the part of each cube that is left, and whether a seam runs over each thing."""
     cells = view.cells[rest]
-    labels = np.full(len(rest), NOTHING)
+    labels, parts = np.full(len(rest), NOTHING), np.zeros(len(rest), int)
     if not len(rest):
-        return labels, ()
+        return labels, parts, ()
     pairs = KDTree(cells).query_pairs(max(0.01, LINK * view.edge), output_type="ndarray")
     core = np.bincount(pairs.ravel(), minlength=len(rest)) >= CORE
-    group = _joined(pairs[core[pairs].all(1)], len(rest))
+    group = joined(pairs[core[pairs].all(1)], len(rest))
     levels = [plane for plane in planes if plane[:3] @ planes[0][:3] > 0.9]
     _join_floating(cells, group, levels)
     sizes = np.bincount(group)
     large = [int(g) for g in np.argsort(-sizes, kind="stable") if sizes[g] >= LEAST_THING]
+    surface = None if view.camera is None else Surface(cells, view.normals[rest], view.camera, view.edge, pairs)
     seams: list[bool] = []
     for g in large:
-        own = group == g
+        own = np.flatnonzero(group == g)
         if _is_other(cells[own], levels):
             labels[own] = OTHER
             continue
         labels[own] = len(seams)
-        seams.append(_has_seam(view, rest, np.flatnonzero(own), pairs))
-    _take_fragments(cells, labels)
+        parts[own], seam = parted(surface, own, levels) if surface else (0, False)
+        seams.append(seam)
+    _take_fragments(cells, labels, parts)
     labels[(labels == NOTHING) & (sizes[group] >= LEAST_SPECK)] = SPECK
-    return labels, tuple(seams)
+    return labels, parts, tuple(seams)
 
 
 def _is_other(cells: Float[np.ndarray, "k 3"], levels: list[Float[np.ndarray, "4"]]) -> bool:
@@ -347,36 +349,13 @@ def _join_floating(
             group[group == g] = group[near[gap[beside & (gap < GAP)].argmin()]]
 
 
-def _joined(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " count"]:
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
-
-
-def _take_fragments(cells: Float[np.ndarray, "r 3"], labels: Int[np.ndarray, " r"]) -> None:
-    """Give scattered cubes to the thing beside them, in place."""
+def _take_fragments(
+    cells: Float[np.ndarray, "r 3"], labels: Int[np.ndarray, " r"], parts: Int[np.ndarray, " r"]
+) -> None:
+    """Give scattered cubes to the thing beside them, and to its part, in place."""
     things, scattered = np.flatnonzero(labels >= 0), np.flatnonzero(labels == NOTHING)
     if len(things) and len(scattered):
         away, nearest = KDTree(cells[things]).query(cells[scattered])
         near = np.flatnonzero(away < FRAGMENT)
-        labels[scattered[near]] = labels[things[np.asarray(nearest)[near]]]
-
-
-def _has_seam(
-    view: _View, rest: Int[np.ndarray, " r"], own: Int[np.ndarray, " o"], pairs: Int[np.ndarray, "p 2"]
-) -> bool:
-    """Whether a thing falls into two large parts where its surface turns inward; unknown without a camera's place."""
-    if view.camera is None:
-        return False
-    place = np.full(len(rest), -1)
-    place[own] = np.arange(len(own))
-    mine = place[pairs[(place[pairs] >= 0).all(1)]]
-    cells, normals = view.cells[rest[own]], view.normals[rest[own]]
-    i, j = mine.T
-    between = cells[j] - cells[i]
-    between = between / np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
-    # Normals of a convex surface turn away from each other, those at a seam towards each other.
-    inward = ((normals[i] - normals[j]) * between).sum(1)
-    seam = np.bincount(mine[inward > CONCAVE].ravel(), minlength=len(own)) > 0
-    smooth = mine[~seam[mine].any(1)]
-    sizes = sorted(np.bincount(_joined(smooth, len(own))).tolist(), reverse=True)
-    return len(sizes) > 1 and sizes[1] >= PART * len(own)
+        beside = things[np.asarray(nearest)[near]]
+        labels[scattered[near]], parts[scattered[near]] = labels[beside], parts[beside]
