@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,6 +37,13 @@ class Surface:
     """Edge of the cubes [m]."""
     pairs: Int[np.ndarray, "p 2"]
     """Neighbours."""
+
+    @cached_property
+    def rays(self) -> tuple[KDTree, Float[np.ndarray, " r"]]:
+        """Search tree of the unit directions in which the camera saw the cells, and how far away they are [m]."""
+        rays = self.cells - self.camera
+        far = np.linalg.norm(rays, axis=1)
+        return KDTree(rays / far[:, None]), far
 
 
 def joined(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " count"]:
@@ -141,7 +149,7 @@ def _bottom(along: Float[np.ndarray, "k 2"], height: Float[np.ndarray, " k"]) ->
 
 def _seen_free(surface: Surface, places: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
     """Whether the camera saw past each place, so that nothing is there."""
-    rays, ways = surface.cells - surface.camera, places - surface.camera
-    far, away = np.linalg.norm(rays, axis=1), np.linalg.norm(ways, axis=1)
-    apart, nearest = KDTree(rays / far[:, None]).query(ways / away[:, None])
+    (rays, far), ways = surface.rays, places - surface.camera
+    away = np.linalg.norm(ways, axis=1)
+    apart, nearest = rays.query(ways / away[:, None])
     return np.asarray((apart * away > 1.5 * surface.edge) | (far[nearest] > away + BEHIND))
