@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from playwright.sync_api import Page
 from viser import UploadedFile
@@ -28,7 +29,7 @@ from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress
 from tests.helpers.browser import free_port, page_of
-from tests.helpers.made_scenes import MadeScene, make_scene
+from tests.helpers.made_scenes import MadeScene, make_scene, overlap, render_scene
 from tests.helpers.weights import untrained_weights
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
@@ -117,6 +118,28 @@ def test_a_click_takes_the_thing_that_is_seen_there(page: ScenePage, made: MadeS
                 away = np.linalg.norm(around.points[:, None] - seen(page, other), axis=-1).min()
                 assert away < 0.02
     assert "**3 grasps** of thing" in page.status.content
+
+
+def test_a_click_takes_one_side_of_things_that_touch(page: ScenePage) -> None:
+    boxes = [trimesh.creation.box(bounds=box) for box in (
+        ((-0.04, -0.07, 0.0), (0.04, 0.07, 0.06)), ((0.04, -0.03, 0.0), (0.10, 0.03, 0.16)))]
+    made = render_scene("table", boxes, ("low", "tall"), np.random.default_rng(0), 2)
+    page.open(made.load())
+    assert page.cloud.scene.segments.count == 1
+    aimed(page, np.array([0.07, 0.0, 0.155]))
+    assert page.offer is not None
+    assert len(page.offer.found.chosen.own) == (page.cloud.labels == 0).sum()
+    page.one_side.value = True
+    for k, place in enumerate(((0.0, 0.0, 0.06), (0.07, 0.0, 0.155))):
+        aimed(page, np.array(place))
+        assert overlap(made, k, page.offer.found.chosen.pixels) > 0.8
+        assert isinstance(page.predictor, Quick)
+        assert page.predictor.asked[-1].constraints.obstacles is not None
+    page._other()  # other grasps of the same side
+    assert overlap(made, 1, page.offer.found.chosen.pixels) > 0.8
+    page.one_side.value = False
+    aimed(page, np.array([0.07, 0.0, 0.155]))
+    assert page.offer.wish.side is None
 
 
 def test_grasps_are_ranked_and_one_is_shown(page: ScenePage) -> None:

@@ -67,6 +67,7 @@ class Wish:
     cloud: SceneCloud
     number: int  # of the thing
     seed: int = 0
+    side: Float[np.ndarray, "3"] | None = None  # A place on the side that is meant [m]; all of the thing if there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,9 @@ class ScenePage(Page):
         self.status = gui.add_markdown("")
         with gui.add_folder("1  The thing"):
             self.thing = gui.add_dropdown("Thing", (str(NO_THING),), initial_value=NO_THING, hint="As labelled in the scene.")
+            self.one_side = gui.add_checkbox(
+                "Things touch: take one side", False,
+                hint="Where things that touch are taken for one: click the one that you mean; the other is avoided.")
             self.notes = gui.add_markdown("")
         with gui.add_folder("2  Its grasps"):
             self.grasp = gui.add_dropdown("Grasp", (str(NO_GRASP),), initial_value=NO_GRASP, disabled=True,
@@ -202,7 +206,10 @@ class ScenePage(Page):
         if row is None:
             self._tell(NOTHING_THERE)
         elif (label := int(cloud.labels[row])) >= 0:
-            self._again(label)
+            if self.one_side.value:
+                self.pick(label, side=cloud.world[row])
+            else:
+                self._again(label)
         elif label == STRUCTURE:
             self._on_structure(cloud.world[row])
         else:
@@ -215,7 +222,7 @@ class ScenePage(Page):
     def _again(self, number: int) -> None:
         """A thing was clicked, perhaps once more: then other grasps are made if there are none."""
         wish = self._wish
-        if wish is None or wish.number != number:
+        if wish is None or wish.number != number or wish.side is not None:
             self.pick(number)
         elif self.offer is None and wish is self._answered:
             self.pick(number, wish.seed + 1)
@@ -233,12 +240,12 @@ class ScenePage(Page):
             self.cloud.colour(None, None)
             self._tell(FIRST)
 
-    def pick(self, number: int, seed: int = 0) -> None:
-        """Take a thing and make its grasps; what is made for another one is dropped."""
+    def pick(self, number: int, seed: int = 0, side: Float[np.ndarray, "3"] | None = None) -> None:
+        """Take a thing, or its side at a place, and make its grasps; what is made for another one is dropped."""
         cloud = self.cloud
         if not 0 <= number < cloud.scene.segments.count:
             raise OptionError(f"there is no thing {number + 1}; '{cloud.scene.name}' shows {cloud.scene.segments.count}")
-        self._wish = Wish(cloud, number, seed)
+        self._wish = Wish(cloud, number, seed, side)
         self.offer = None
         self._forget()
         cloud.colour(number, None)
@@ -249,7 +256,7 @@ class ScenePage(Page):
     def _other(self) -> None:
         """Make other grasps of the same thing."""
         if (wish := self._wish) is not None:
-            self.pick(wish.number, wish.seed + 1)
+            self.pick(wish.number, wish.seed + 1, wish.side)
 
     # Work
 
@@ -299,7 +306,8 @@ class ScenePage(Page):
         try:
             begin = time.perf_counter()
             self._say(f"**Thing {wish.number + 1}**: its unseen side is estimated ...")
-            found = wish.cloud.scene.object_at(place_on_thing(wish.cloud.scene, wish.number), name=name)
+            place = place_on_thing(wish.cloud.scene, wish.number) if wish.side is None else wish.side
+            found = wish.cloud.scene.object_at(place, part=wish.side is not None, name=name)
             self._still(wish)
             wish.cloud.colour(wish.number, found.chosen, found.obj)
             self.notes.content = self._notes(wish, found)
