@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from dro_grasp.arm.motion import PLACING
+from dro_grasp.arm.planning.motion import PLACING
 from dro_grasp.compare.metrics import success_rate
 from lab.measurements import FLAT_THINGS, ROBOTS, TEST_OBJECTS
 from lab.reading import MissingResult, Results, of, table

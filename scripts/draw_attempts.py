@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dro_grasp.arm.animation import OBJECT_COLOUR, Recorder
-from dro_grasp.arm.attempts import Attempt, read_attempts
-from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.planning.motion import MotionPlan
+from dro_grasp.arm.planning.physics import LiftScene
+from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.tabletop import TabletopConfig, carry_out
-from dro_grasp.arm.workcell import Workcell
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.tabletop.animation import OBJECT_COLOUR, Recorder
+from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, carry_out
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, render
 from dro_grasp.objects.catalogue import load_object
 

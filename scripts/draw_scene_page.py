@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from dro_grasp.arm.physics import LiftScene
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.tabletop import TabletopConfig, depth_image, scatter, thinned_intrinsics
-from dro_grasp.arm.workcell import Workcell
+from dro_grasp.arm.planning.physics import LiftScene
+from dro_grasp.arm.planning.workcell import Workcell
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, depth_image, scatter, thinned_intrinsics
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.browser import page_of
 

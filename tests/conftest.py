@@ -93,7 +93,7 @@ def finished(home: Path, results: dict) -> dict[str, Path]:
 @pytest.fixture(scope="session")
 def robot():
     """The built-in xArm 7 with a LEAP hand."""
-    from dro_grasp.arm.robot_loading import load_robot
+    from dro_grasp.arm.robots.loading import load_robot
 
     return load_robot("xarm7_leaphand")
 
@@ -103,7 +103,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The file of the built-in xArm 7 with a hand that loads quickly, and without a camera."""
     import yaml
 
-    from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS
+    from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 
     values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
     # This hand's palm faces along the flange, LEAP's across it.

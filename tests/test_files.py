@@ -158,7 +158,7 @@ def test_files_set_aside_keep_their_content_and_what_belongs_together_its_number
 def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import dro_grasp as dro
     from dro_grasp.apps.server.client import sent_object
-    from dro_grasp.arm.motion import MotionPlan
+    from dro_grasp.arm.planning.motion import MotionPlan
     from dro_grasp.compare.methods import make_method
     from dro_grasp.frames import read_motion
     from dro_grasp.geometry.cache import cache_folder

@@ -45,7 +45,7 @@ def test_the_wheel_holds_all_that_grasping_needs(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("dro_grasp-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    kinds = ("weights/**/*.safetensors", "weights/SHA256SUMS", "hands/builtin/*", "arm/builtin/*", "py.typed")
+    kinds = ("weights/**/*.safetensors", "weights/SHA256SUMS", "hands/builtin/*", "arm/robots/builtin/*", "py.typed")
     shipped = {str(p.relative_to(ROOT / "src")) for kind in kinds for p in (ROOT / "src" / "dro_grasp").glob(kind)}
     assert len(shipped) > 8
     assert shipped <= names

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dro_grasp import errors
-from dro_grasp.arm.attempts import Attempt
+from dro_grasp.arm.tabletop.attempts import Attempt
 from dro_grasp.geometry.multilateration import MultilaterationConfig
 from dro_grasp.grasps.columns import (
     CAMERA,

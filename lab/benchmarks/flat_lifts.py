@@ -12,10 +12,10 @@ import argparse
 import dataclasses
 from dataclasses import replace
 
-from dro_grasp.arm.attempts import Attempt, failures
-from dro_grasp.arm.robot import Table
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.tabletop import TabletopConfig, attempt
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Table
+from dro_grasp.arm.tabletop.attempts import Attempt, failures
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.predictor import GraspPredictor

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dro_grasp.arm.attempts import Attempt, endings, failures, lifted, processor_seconds
-from dro_grasp.arm.reachability import Fault
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.table_scene import PickedObject
-from dro_grasp.arm.tabletop import TabletopConfig, attempt
-from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
-from dro_grasp.arm.task import PlanConfig
-from dro_grasp.arm.workcell import upright
+from dro_grasp.arm.planning.reachability import Fault
+from dro_grasp.arm.planning.task import PlanConfig
+from dro_grasp.arm.planning.workcell import upright
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.tabletop.attempts import Attempt, endings, failures, lifted, processor_seconds
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
+from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
+from dro_grasp.arm.tabletop.table_scene import PickedObject
 from dro_grasp.compare.methods import mean_grasps_of
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from dro_grasp.arm.motion import STAGES, MotionPlan
-from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
+from dro_grasp.arm.planning.motion import STAGES, MotionPlan
+from dro_grasp.arm.planning.workcell import Workcell, arm_addresses, robot_spec
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
 from lab.benchmarks.report import emit

@@ -21,7 +21,7 @@ import yaml
 from safetensors.torch import load, save
 
 from dro_grasp.apps.library import store_upload
-from dro_grasp.arm.robot_loading import load_robot
+from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.errors import DroGraspError
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion

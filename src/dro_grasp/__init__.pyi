@@ -3,21 +3,27 @@
 from ._version import __version__ as __version__
 from .apps.server.client import GraspClient as GraspClient
 from .apps.viewer.grasp_page import view_grasps as view_grasps
-from .arm.attempts import Attempt as Attempt
-from .arm.clearing import Bin as Bin, ClearConfig as ClearConfig, Cleared as Cleared, Rig as Rig, clear_table as clear_table
-from .arm.flat_plans import plan_or_slide as plan_or_slide
-from .arm.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
-from .arm.picks import Pick as Pick
-from .arm.planner import plan as plan
-from .arm.reachability import ReachConfig as ReachConfig
-from .arm.robot import Robot as Robot
+from .arm.clearing.loop import (
+    Bin as Bin,
+    ClearConfig as ClearConfig,
+    Cleared as Cleared,
+    Rig as Rig,
+    clear_table as clear_table,
+)
+from .arm.clearing.picks import Pick as Pick
+from .arm.flat.plans import plan_or_slide as plan_or_slide
+from .arm.planning.motion import MotionPlan as MotionPlan, trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
+from .arm.planning.planner import plan as plan
+from .arm.planning.reachability import ReachConfig as ReachConfig
+from .arm.planning.task import PlanConfig as PlanConfig
+from .arm.planning.task_stages import task_stages as task_stages, task_yaml as task_yaml
 from .arm.robot_check import RobotReport as RobotReport, check_robot as check_robot
-from .arm.robot_loading import load_robot as load_robot
-from .arm.table_scene import PickedObject as PickedObject, pick_object as pick_object
-from .arm.tabletop import TabletopConfig as TabletopConfig
-from .arm.tabletop_run import TabletopRun as TabletopRun, run_tabletop as run_tabletop
-from .arm.task import PlanConfig as PlanConfig
-from .arm.task_stages import task_stages as task_stages, task_yaml as task_yaml
+from .arm.robots.loading import load_robot as load_robot
+from .arm.robots.robot import Robot as Robot
+from .arm.tabletop.attempts import Attempt as Attempt
+from .arm.tabletop.experiment import TabletopConfig as TabletopConfig
+from .arm.tabletop.run import TabletopRun as TabletopRun, run_tabletop as run_tabletop
+from .arm.tabletop.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval
 from .errors import DroGraspError as DroGraspError

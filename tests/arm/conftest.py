@@ -8,10 +8,10 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.planner import plan
-from dro_grasp.arm.task import PlanConfig
-from dro_grasp.arm.workcell import ARM
+from dro_grasp.arm.planning.motion import MotionPlan
+from dro_grasp.arm.planning.planner import plan
+from dro_grasp.arm.planning.task import PlanConfig
+from dro_grasp.arm.planning.workcell import ARM
 
 PLACE = (0.5, 0.1)
 

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.arm import clearing_trial
-from dro_grasp.arm.clearing import Cleared, Pick
-from dro_grasp.arm.clearing_trial import ClearTrial, ClearTrialConfig
+from dro_grasp.arm.clearing import trial as clearing_trial
+from dro_grasp.arm.clearing.loop import Cleared, Pick
+from dro_grasp.arm.clearing.trial import ClearTrial, ClearTrialConfig
 from dro_grasp.cli.main import main
 
 OBJECTS = ("can", "torus", "bottle")

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import dro_grasp as dro
-from dro_grasp.arm.motion import CHOSEN, STAGES, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.planning.motion import CHOSEN, STAGES, PlanNotes, PlanScene, Trajectory
 from dro_grasp.cli.main import parse
 
 NOTES = PlanNotes("arm", "can", ("a",), ("f",), "world", 0.0, 3, {"out of reach": 2}, 1, 0, 1.5, np.eye(4).tolist(), 7,

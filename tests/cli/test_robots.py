@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS
+from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 from dro_grasp.cli.main import main
 
 

@@ -13,8 +13,8 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp import extras
-from dro_grasp.arm.attempts import Attempt
-from dro_grasp.arm.tabletop import TabletopConfig
+from dro_grasp.arm.tabletop.attempts import Attempt
+from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.cli.main import parse
 
 Lift = Callable[..., int]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.arm.robot_loading import load_robot
+from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.errors import DroGraspError
 from dro_grasp.frames import read_motion
 from dro_grasp.hands.description.loader import Description

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from dro_grasp.arm.robot_loading import BUILTIN_ROBOTS
+from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 
 
 def xarm7() -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.arm.candidates import grasps_in_world
+from dro_grasp.arm.planning.candidates import grasps_in_world
 from dro_grasp.cli.main import main
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.stages import RETURNED, BenchmarkConfig, benchmark, pair_seed

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.arm.workcell import moved
+from dro_grasp.arm.planning.workcell import moved
 from dro_grasp.errors import GraspFileError, ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from dro_grasp.arm.robot import CameraMount, Robot, Table
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.sliding import SlideConfig
-from dro_grasp.arm.workcell import CLEARANCE, TABLE, WORLD, Workcell
+from dro_grasp.arm.flat.sliding import SlideConfig
+from dro_grasp.arm.planning.workcell import CLEARANCE, TABLE, WORLD, Workcell
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import CameraMount, Robot, Table
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour, Mesh, arrow, render
 from dro_grasp.hands.description.loader import Description

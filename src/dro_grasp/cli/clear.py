@@ -11,10 +11,10 @@ from dro_grasp.cli.inputs import Flag, Friction, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.arm.clear_record import ClearRecorder
-    from dro_grasp.arm.clearing import Pick
-    from dro_grasp.arm.clearing_trial import ClearTrialConfig
-    from dro_grasp.arm.robot import Robot
+    from dro_grasp.arm.clearing.loop import Pick
+    from dro_grasp.arm.clearing.record import ClearRecorder
+    from dro_grasp.arm.clearing.trial import ClearTrialConfig
+    from dro_grasp.arm.robots.robot import Robot
 
 
 VIDEO_EVERY = 4  # The animation shows each fourth moment that is recorded, and is four times as fast (ours)
@@ -55,10 +55,10 @@ class Clear:
 
     def run(self) -> int:
         """Clear what is missing, store and print."""
-        from dro_grasp.arm.animation import FORMATS
-        from dro_grasp.arm.clear_record import ClearRecorder
-        from dro_grasp.arm.clearing_trial import clear_trial
-        from dro_grasp.arm.robot_loading import load_robot
+        from dro_grasp.arm.clearing.record import ClearRecorder
+        from dro_grasp.arm.clearing.trial import clear_trial
+        from dro_grasp.arm.robots.loading import load_robot
+        from dro_grasp.arm.tabletop.animation import FORMATS
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output
@@ -106,9 +106,9 @@ class Clear:
         return 0
 
     def _config(self) -> ClearTrialConfig:
-        from dro_grasp.arm.clearing import Bin, ClearConfig
-        from dro_grasp.arm.clearing_trial import ClearTrialConfig
-        from dro_grasp.arm.task import PlanConfig
+        from dro_grasp.arm.clearing.loop import Bin, ClearConfig
+        from dro_grasp.arm.clearing.trial import ClearTrialConfig
+        from dro_grasp.arm.planning.task import PlanConfig
 
         box = Bin() if self.bin is None else Bin(self.bin[:2], self.bin[2:4], self.bin[4])
         plan = PlanConfig(self.num, rehearsals=self.rehearsals, friction=self.friction)
@@ -116,7 +116,7 @@ class Clear:
 
     def _keep(self, robot: Robot, recorder: ClearRecorder) -> None:
         """Write what was recorded, and its animation."""
-        from dro_grasp.arm.animation import draw_animation
+        from dro_grasp.arm.tabletop.animation import draw_animation
 
         if self.record is not None:
             recorder.record(robot, self.robot).save(self.record)

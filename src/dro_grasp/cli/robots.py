@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from dro_grasp.arm.attempts import Attempt
-    from dro_grasp.arm.motion import MotionPlan
-    from dro_grasp.arm.robot import Robot
-    from dro_grasp.arm.table_scene import PickedObject
+    from dro_grasp.arm.planning.motion import MotionPlan
+    from dro_grasp.arm.robots.robot import Robot
+    from dro_grasp.arm.tabletop.attempts import Attempt
+    from dro_grasp.arm.tabletop.table_scene import PickedObject
     from dro_grasp.objects.perception.scene_files import SceneCamera
 
 
@@ -103,11 +103,11 @@ class Plan:
 
     def run(self, make: Callable[..., MotionPlan] | None = None) -> int:
         """Check everything that can be checked before the work, then plan, or make the plan in another way, and write."""
-        from dro_grasp.arm.flat_plans import plan_or_slide
-        from dro_grasp.arm.placing import Place
-        from dro_grasp.arm.planner import plan
-        from dro_grasp.arm.robot_loading import load_robot
-        from dro_grasp.arm.task import PlanConfig
+        from dro_grasp.arm.flat.plans import plan_or_slide
+        from dro_grasp.arm.planning.placing import Place
+        from dro_grasp.arm.planning.planner import plan
+        from dro_grasp.arm.planning.task import PlanConfig
+        from dro_grasp.arm.robots.loading import load_robot
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output
@@ -162,8 +162,8 @@ class Plan:
 
     def _write(self, made: MotionPlan, robot: Robot) -> dict[str, str]:
         """Write the files that were asked for; returns their paths."""
-        from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
-        from dro_grasp.arm.task_stages import task_yaml
+        from dro_grasp.arm.planning.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.arm.planning.task_stages import task_yaml
         from dro_grasp.files import replacing
 
         if self.efforts and made.notes.squeeze_torque is None:
@@ -199,8 +199,8 @@ class Plan:
         """The object with what stands around it, and where its frame is in the world."""
         import numpy as np
 
-        from dro_grasp.arm.robot import Table
-        from dro_grasp.arm.table_scene import PickedObject, as_picked, at_seen_height, picked_flat, seen_on_table
+        from dro_grasp.arm.robots.robot import Table
+        from dro_grasp.arm.tabletop.table_scene import PickedObject, as_picked, at_seen_height, picked_flat, seen_on_table
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
@@ -294,10 +294,10 @@ class Tabletop:
         from dro_grasp.extras import require_extra
 
         require_extra("arm")
-        from dro_grasp.arm.animation import FORMATS, draw_attempt
-        from dro_grasp.arm.tabletop import TabletopConfig
-        from dro_grasp.arm.tabletop_run import TabletopRun, run_tabletop
-        from dro_grasp.arm.task import PlanConfig
+        from dro_grasp.arm.planning.task import PlanConfig
+        from dro_grasp.arm.tabletop.animation import FORMATS, draw_attempt
+        from dro_grasp.arm.tabletop.experiment import TabletopConfig
+        from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
@@ -318,7 +318,7 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.arm.attempts import endings, failures, lifted, placing_errors, processor_seconds
+        from dro_grasp.arm.tabletop.attempts import endings, failures, lifted, placing_errors, processor_seconds
         from dro_grasp.compare.metrics import wilson_interval
 
         held = sum(a.success for a in done)
@@ -391,7 +391,7 @@ class Robots:
 
     def run(self) -> int:
         """Print the names."""
-        from dro_grasp.arm.robot_loading import robot_names
+        from dro_grasp.arm.robots.loading import robot_names
 
         names = robot_names()
         print_result(self.json, {"robots": names}, "robots", ["name"], [[n] for n in names], "also: the path of a robot.yaml")

@@ -78,7 +78,7 @@ class View:
             require_extra("arm")
             from dro_grasp.apps.viewer.clear_page import clear_page
             from dro_grasp.apps.viewer.lift_page import lift_page
-            from dro_grasp.arm.clear_record import is_record
+            from dro_grasp.arm.clearing.record import is_record
 
             if is_record(self.file):
                 (show or serve)(clear_page(self.file, self.robot, self.port, self.host, token))
@@ -125,7 +125,7 @@ class View:
         else:
             require_extra("arm")
             from dro_grasp.apps.viewer.scene_motion import RobotScenePage
-            from dro_grasp.arm.robot_loading import load_robot
+            from dro_grasp.arm.robots.loading import load_robot
             from dro_grasp.errors import OptionError
 
             robot = load_robot(self.robot)

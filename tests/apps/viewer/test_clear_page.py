@@ -10,7 +10,7 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp.apps.viewer.clear_page import ClearPage, clear_page, now, picks
-from dro_grasp.arm.clear_record import ClearRecord, Judgement, Look, Picked
+from dro_grasp.arm.clearing.record import ClearRecord, Judgement, Look, Picked
 from dro_grasp.cli.view import View
 from tests.helpers.browser import free_port
 

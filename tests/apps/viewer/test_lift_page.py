@@ -11,11 +11,11 @@ import pytest
 import dro_grasp as dro
 from dro_grasp.apps.viewer.film import Film
 from dro_grasp.apps.viewer.lift_page import EVERY, LiftPage, lift_page
-from dro_grasp.arm.animation import Recorder
-from dro_grasp.arm.attempts import Attempt, write_attempts
-from dro_grasp.arm.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.robot_check import robot_shapes, shape_poses
-from dro_grasp.arm.tabletop import TabletopConfig
+from dro_grasp.arm.tabletop.animation import Recorder
+from dro_grasp.arm.tabletop.attempts import Attempt, write_attempts
+from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights

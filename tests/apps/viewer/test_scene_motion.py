@@ -18,9 +18,9 @@ from dro_grasp.apps.viewer import scene_motion
 from dro_grasp.apps.viewer.film import Film
 from dro_grasp.apps.viewer.scene_motion import RobotScenePage, levelled, surroundings
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
-from dro_grasp.arm.motion import ALL_STAGES, CHOSEN, MotionPlan, PlanNotes, PlanScene, Trajectory
-from dro_grasp.arm.placing import height_below
-from dro_grasp.arm.reachability import Fault
+from dro_grasp.arm.planning.motion import ALL_STAGES, CHOSEN, MotionPlan, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.planning.placing import height_below
+from dro_grasp.arm.planning.reachability import Fault
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import Scene
@@ -97,8 +97,8 @@ def page(
 
     monkeypatch.setattr(scene_motion, "predicted", predicted)
     monkeypatch.setattr(scene_motion, "plan", plan)
-    monkeypatch.setattr("dro_grasp.arm.reachability.Reachability.ways", ways)
-    monkeypatch.setattr("dro_grasp.arm.reachability.Reachability.hopeless", lambda *_: {})
+    monkeypatch.setattr("dro_grasp.arm.planning.reachability.Reachability.ways", ways)
+    monkeypatch.setattr("dro_grasp.arm.planning.reachability.Reachability.hopeless", lambda *_: {})
     served = ServedPage(free_port(), HOST)
     made = RobotScenePage(served.server, dro.GraspPredictor(str(untrained_weights(tmp_path))), scene, robot)
     yield made

@@ -8,10 +8,10 @@ import numpy as np
 
 from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
-from dro_grasp.arm.animation import FIXTURE_COLOUR, VIEW, colour_of
-from dro_grasp.arm.clear_record import ClearRecord, Event, Judgement, Look, Picked
-from dro_grasp.arm.robot import Robot, Table
-from dro_grasp.arm.robot_loading import load_robot
+from dro_grasp.arm.clearing.record import ClearRecord, Event, Judgement, Look, Picked
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.tabletop.animation import FIXTURE_COLOUR, VIEW, colour_of
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.grasps.hold import HoldState

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.arm.animation import Recorder
-from dro_grasp.arm.motion import ALL_STAGES, SLIDING, MotionPlan
-from dro_grasp.arm.reachability import carried
-from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.planning.motion import ALL_STAGES, SLIDING, MotionPlan
+from dro_grasp.arm.planning.reachability import carried
+from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.tabletop.animation import Recorder
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.hold import HoldState
 from dro_grasp.objects.shape import ObjectModel

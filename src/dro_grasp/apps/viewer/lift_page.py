@@ -13,12 +13,12 @@ import viser
 from dro_grasp.apps.viewer.film import RATE, Film
 from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
-from dro_grasp.arm.animation import VIEW, Recorder, colour_of
-from dro_grasp.arm.attempts import Attempt, read_attempts
-from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan
-from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.robot_loading import load_robot
-from dro_grasp.arm.tabletop import TabletopConfig, attempt
+from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.tabletop.animation import VIEW, Recorder, colour_of
+from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
 from dro_grasp.network.checkpoints import describe_weights

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
-from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.geometry.rendering.rasterizer import Colour
 from dro_grasp.grasps.hold import HoldState
 

@@ -18,13 +18,13 @@ from dro_grasp.apps.viewer.robot_view import RobotView
 from dro_grasp.apps.viewer.scene_cloud import POINT, shades
 from dro_grasp.apps.viewer.scene_page import STRUCTURE_THERE, Offer, ScenePage, Wish
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
-from dro_grasp.arm.animation import VIEW
-from dro_grasp.arm.candidates import predicted
-from dro_grasp.arm.motion import MotionPlan
-from dro_grasp.arm.placing import Place, foot, height_below
-from dro_grasp.arm.planner import plan
-from dro_grasp.arm.robot import Robot
-from dro_grasp.arm.task import PlanConfig, Task
+from dro_grasp.arm.planning.candidates import predicted
+from dro_grasp.arm.planning.motion import MotionPlan
+from dro_grasp.arm.planning.placing import Place, foot, height_below
+from dro_grasp.arm.planning.planner import plan
+from dro_grasp.arm.planning.task import PlanConfig, Task
+from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.tabletop.animation import VIEW
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour

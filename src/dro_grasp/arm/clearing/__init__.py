@@ -1,0 +1,1 @@
+"""Many things: a table that is emptied into a bin, one pick after the other."""

@@ -1,0 +1,106 @@
+"""A plan as the stages of a task, for MoveIt Task Constructor and others that plan the motions between them anew.
+
+Each stage has the name of a class of MoveIt Task Constructor as `type`, and the values that its setters take. Joints are those
+of the robot's description. Source: MoveIt Task Constructor, stages MoveTo, MoveRelative and ModifyPlanningScene.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.arm.planning.motion import DIGITS, MotionPlan
+from dro_grasp.arm.planning.workcell import wxyz
+from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.grasps.export.writers import yaml_text
+
+ARM = "arm"  # Name of the group of the arm's joints
+HAND = "hand"  # And of those of the hand
+SHORTEST = 0.001  # Straight motions that are shorter are none [m] (ours)
+
+
+def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
+    """The stages of a plan for a robot, in their order, as plain values: metres, radians, quaternions WXYZ, Nm or N."""
+    hand, thing, wrist = robot.hand_joints, plan.notes.object, robot.hand.wrist_link
+    links, frame = list(robot.hand.tree.link_names), plan.notes.frame
+    if plan.notes.slide is not None:
+        return [{"name": "current state", "type": "CurrentState"}] + [stage | {"frame": frame} for stage in (
+            _joints("open", HAND, hand, _last(plan, HAND, "reach")), _pose("reach", plan, robot, "reach"),
+            _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
+            {"name": "hand may touch", "type": "ModifyPlanningScene",
+             "allow_collisions": {"first": thing, "second": links}},
+            *(part for name in ("approach", "press", "slide", "retreat") for part in _straight(name, plan, robot, name)),
+            _pose("look again", plan, robot, "look again"))]
+    allowed = {"allow_collisions": {"first": thing, "second": links}}
+    stages = [
+        {"name": "current state", "type": "CurrentState"},
+        _joints("open", HAND, hand, _last(plan, HAND, "reach")),
+        _pose("reach", plan, robot, "reach"),
+        _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
+        {"name": "hand may touch", "type": "ModifyPlanningScene", **allowed},
+        *_straight("approach", plan, robot, "approach"),
+        _joints("close", HAND, hand, plan.squeeze, plan.notes.squeeze_torque),
+        {"name": "attach", "type": "ModifyPlanningScene", "attach_objects": {"objects": [thing], "link": wrist}},
+        *_straight("lift", plan, robot, "lift"),
+    ]
+    if plan.notes.place is not None:
+        stages += [
+            _pose("carry", plan, robot, "carry"),
+            *_straight("lower", plan, robot, "lower"),
+            _joints("release", HAND, hand, _last(plan, HAND, "release")),
+            {"name": "detach", "type": "ModifyPlanningScene", "detach_objects": {"objects": [thing], "link": wrist}},
+            *_straight("retreat", plan, robot, "retreat"),
+        ]
+    return [stage | ({"frame": frame} if stage["type"] != "CurrentState" else {}) for stage in stages]
+
+
+def task_yaml(plan: MotionPlan, robot: Robot) -> str:
+    """The stages of a plan as YAML."""
+    does = "push" if plan.notes.slide is not None else "lift" if plan.notes.place is None else "lift and place"
+    return (f"# Stages of a task: {does} '{plan.notes.object}' with robot '{robot.name}'. Types are those of MoveIt Task "
+            "Constructor.\n# Metres, radians, Nm or N; quaternions WXYZ; joints as the robot's description counts them.\n"
+            + yaml_text({"groups": {ARM: list(robot.arm_joints), HAND: list(robot.hand_joints)},
+                         "stages": task_stages(plan, robot)}))
+
+
+def _last(plan: MotionPlan, group: str, stage: str) -> Float[np.ndarray, " n"]:
+    """Joints at the end of a stage."""
+    return (plan.arm if group == ARM else plan.hand).position[plan.part(stage)][-1]
+
+
+def _joints(
+    name: str, group: str, names: tuple[str, ...], values: Float[np.ndarray, " n"], effort: tuple[float, ...] | None = None
+) -> dict[str, Any]:
+    """A motion to joints."""
+    stage: dict[str, Any] = {"name": name, "type": "MoveTo", "group": group, "goal": {"joints": _named(names, values)}}
+    return stage if effort is None else stage | {"effort": _named(names, np.array(effort))}
+
+
+def _pose(name: str, plan: MotionPlan, robot: Robot, stage: str) -> dict[str, Any]:
+    """A free motion of the arm to the wrist pose at the end of a stage; its joints reach it without a collision."""
+    joints = _last(plan, ARM, stage)
+    T = robot.T_world_wrist(joints)
+    pose = {"position": _rounded(T[:3, 3]), "orientation_wxyz": _rounded(wxyz(T[:3, :3]))}
+    goal = {"pose": pose, "joints": _named(robot.arm_joints, joints)}
+    return {"name": name, "type": "MoveTo", "group": ARM, "ik_frame": robot.hand.wrist_link, "goal": goal}
+
+
+def _straight(name: str, plan: MotionPlan, robot: Robot, stage: str) -> list[dict[str, Any]]:
+    """A straight motion of the wrist; nothing where it stays."""
+    rows = plan.arm.position[plan.part(stage)]
+    way = robot.T_world_wrist(rows[-1])[:3, 3] - robot.T_world_wrist(rows[0])[:3, 3]
+    length = float(np.linalg.norm(way))
+    if length < SHORTEST:
+        return []
+    return [{"name": name, "type": "MoveRelative", "group": ARM, "ik_frame": robot.hand.wrist_link,
+             "direction": _rounded(way / length), "distance": round(length, DIGITS)}]
+
+
+def _named(names: tuple[str, ...], values: Float[np.ndarray, " n"]) -> dict[str, float]:
+    return dict(zip(names, _rounded(values), strict=True))
+
+
+def _rounded(values: Float[np.ndarray, " n"]) -> list[float]:
+    return (np.round(values, DIGITS) + 0.0).tolist()

@@ -1,0 +1,165 @@
+"""Attempts with many objects: those that a file does not hold yet, each stored when it ends."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from dro_grasp.arm.planning.motion import MotionPlan
+from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts, write_attempts
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher, attempt
+from dro_grasp.arm.tabletop.table_scene import PickedObject
+from dro_grasp.devices import one_thread
+from dro_grasp.errors import OptionError
+from dro_grasp.extras import require_extra
+from dro_grasp.files import check_output, make_folder
+from dro_grasp.kinds import Checked, checked
+from dro_grasp.network.checkpoints import DEFAULT, describe_weights
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.predictor import GraspPredictor
+
+
+@dataclass(frozen=True)
+class TabletopRun(Checked):
+    """What is attempted."""
+
+    robot: str
+    """Name or file."""
+    objects: tuple[str, ...]
+    """Names or files of meshes."""
+    attempts: int = 10
+    """Attempts with each object. Source: paper, real-robot experiment."""
+    seed: int = 0
+    """Seed of all draws."""
+    weights: str | None = None
+    """Name or file of weights; the shipped ones by default."""
+    config: TabletopConfig = field(default_factory=TabletopConfig)
+    """How attempts run."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run.
+
+        Raises:
+            OptionError: No attempts, or no objects, or a seed that is none.
+        """
+        super().__post_init__()
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
+        if self.attempts < 1 or not self.objects:
+            raise OptionError(f"{self.attempts} attempts on {len(self.objects)} objects; ask for at least one of each")
+
+
+@dataclass
+class PlanKeeper(Watcher):
+    """Stores the plan of an attempt."""
+
+    path: Path
+
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """Write it."""
+        made.save(self.path)
+
+
+@checked
+def run_tabletop(
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Callable[[Attempt], None] | None = None,
+    plans: Path | None = None, make: Callable[..., Attempt] | None = None,
+) -> list[Attempt]:
+    """Run all attempts that `output` does not hold yet; each is stored when it ends.
+
+    Args:
+        run: What is attempted.
+        output: Parquet file; attempts with the same robot, objects, weights, settings and seed in it are not repeated, others
+            stay. Files of the same names count as the same only if their contents are.
+        workers: Processes, which share out the objects; with several, attempts are stored object by object.
+        progress: Called after each attempt.
+        plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
+        make: Makes one, instead of `attempt`, with the same arguments.
+
+    Raises:
+        OptionError: The extra is missing, something cannot be attempted, or two objects have one name.
+        RobotError: The robot cannot be used.
+        ObjectError: An object cannot be used.
+        WeightsError: The weights cannot be used.
+        GraspFileError: `output` is there and is no such file.
+        OutputError: `output` or `plans` cannot be written.
+    """
+    require_extra("arm")
+    stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
+    done, names = _done(run, stored, output)
+    missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
+    if plans is not None:
+        make_folder(plans)
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make or attempt):
+        stored.append(result)
+        done[result.object, result.number] = result
+        if output is not None:
+            write_attempts(stored, output)
+        if progress is not None:
+            progress(result)
+    return [done[n, k] for n in names.values() for k in range(run.attempts)]
+
+
+def _done(
+    run: TabletopRun, stored: Sequence[Attempt], output: Path | None
+) -> tuple[dict[tuple[str, int], Attempt], dict[str, str]]:
+    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each."""
+    robot, weights, objects = load_robot(run.robot), describe_weights(run.weights)["sha256"], _objects(run.objects)
+    alike = [a for a in stored if (a.robot, a.settings, a.seed) == (robot.name, run.config.label(), run.seed)]
+    done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
+    for a in done:
+        source, sha256, solid = objects.get(a.object, ("", a.object_sha256, a.solid_sha256))
+        if (a.object_sha256, a.solid_sha256) != (sha256, solid):
+            raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
+                              f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with another "
+                              "output=... and plans=...")
+    return {(a.object, a.number): a for a in done}, {source: name for name, (source, *_) in objects.items()}
+
+
+def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """What each object was given as, and its hashes, by its name."""
+    found: dict[str, tuple[str, str, str]] = {}
+    for source in dict.fromkeys(given):
+        obj = load_object(source)
+        first, _, solid = found.setdefault(obj.name, (source, obj.sha256, obj.solid_sha256))
+        if obj.solid_sha256 != solid:
+            raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
+                              "and plans are stored; rename one of the files, or attempt them apart, each with its own "
+                              "output=... and plans=...")
+    return found
+
+
+def _results(
+    run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
+    if workers <= 1 or len(missing) <= 1:
+        for name, numbers in missing.items():
+            yield from _attempts(run, name, numbers, plans, make)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_all_attempts, run, *item, plans, make) for item in missing.items()]):
+            yield from future.result()
+
+
+def _all_attempts(*task: Any) -> list[Attempt]:
+    with one_thread():
+        return list(_attempts(*task))
+
+
+def _attempts(
+    run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
+    robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
+    weights = describe_weights(run.weights)["sha256"]
+    for number in numbers:
+        keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
+        made = make(robot, obj, number, run.seed, predictor, run.config, keeper)
+        yield replace(
+            made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
+            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights,
+            solid_sha256=obj.solid_sha256)

@@ -1,0 +1,144 @@
+"""Objects on a robot's table: one of what its camera saw is picked, the table is where it was seen, all else is avoided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.arm.flat.things import overhang, seen_flat
+from dro_grasp.arm.planning.placing import LEVEL
+from dro_grasp.arm.planning.workcell import VOXEL
+from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.errors import ObjectError, RobotError
+from dro_grasp.geometry.cache import content_hash
+from dro_grasp.kinds import checked
+from dro_grasp.objects.perception.choosing import Pixel, Spot, within
+from dro_grasp.objects.scenery import FoundObject, Scene
+from dro_grasp.objects.shape import ObjectModel
+
+OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
+BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
+
+
+@dataclass(frozen=True)
+class PickedObject:
+    """One object on a table, ready for planning."""
+
+    obj: ObjectModel
+    """In the world's frame, without what its completion put below the table."""
+    obstacles: list[ObjectModel]
+    """The other things, likewise, if there are any. What is below a point that was seen counts as solid."""
+    robot: Robot
+    """With its table at the height that was seen."""
+
+
+@checked
+def pick_object(
+    scene: Scene, robot: Robot, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
+    nearest: bool = False, part: bool = False, name: str | None = None,
+) -> PickedObject:
+    """One object of what was seen of a robot's table; see `Scene.object_at`, which says how one is chosen.
+
+    Examples:
+        >>> scene = load_scene(depth, camera=robot.camera.as_seen())
+        >>> picked = pick_object(scene, robot, (0.5, 0.1, 0.05))
+        >>> made = plan(picked.robot, picked.obj, obstacles=picked.obstacles)
+
+    Args:
+        scene: What was seen, in the world's frame. What is beside the table is left out.
+        robot: With a table.
+        at: A place on the object or near it, in the world: x, y, z [m].
+        pixel: A pixel that shows it: column and row, from the upper left.
+        mask: Its pixels: an array (h, w), true or not 0 on the object, or the path of a PNG. It also shows what is too flat
+            for the camera's depth, such as a card.
+        nearest: Take what is nearest to the camera.
+        part: Of things that touch, take the one side at the place or the pixel; the other one is avoided.
+        name: What to call it; the scene's name by default.
+
+    Raises:
+        ObjectError: No level plane, nothing on it, or it is not clear which object is meant.
+        OptionError: Two choices are given, or the scene lacks what one of them needs.
+        RobotError: The robot has no table.
+    """
+    seen = seen_on_table(scene, robot)
+    if mask is not None and (flat := picked_flat(seen, robot, mask, name)) is not None:
+        return flat
+    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name), robot)
+
+
+def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
+    """An object that was found on a robot's table; see `pick_object`."""
+    level = at_seen_height(robot, found.obj)
+    assert level.table is not None
+    others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
+    return PickedObject(found.obj, _solid(others, level.table.height), level)
+
+
+def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) -> PickedObject | None:
+    """An object of which the pixels are known, if it lies flat on the table; None for others, and where no camera saw it."""
+    table, sight = _table(robot, scene.name), scene.sight
+    if sight is None or not sight.from_camera:
+        return None
+    flat = seen_flat(name or scene.name, sight.world(), within(scene.name, sight, mask), table, sight.T[:3, 3])
+    if flat is None:
+        return None
+    return PickedObject(flat.obj, flat.others, replace(robot, table=replace(table, height=flat.table)))
+
+
+def seen_on_table(scene: Scene, robot: Robot) -> Scene:
+    """What of a scene in the world is over or under the rectangle of the table, or overhangs it.
+
+    Raises:
+        ObjectError: Nothing is.
+        RobotError: The robot has no table.
+    """
+    table = _table(robot, scene.name)
+    if scene.sight is None:
+        return scene  # which says of itself that it is a mesh
+    world = scene.sight.world()
+    beyond = overhang(world, table)
+    kept = (beyond < 0) | ((beyond < OVERHANG) & (world[:, 2] > table.height - BELOW))
+    if not kept.any():
+        raise ObjectError(f"'{scene.name}' shows nothing of the table at {table.centre} m; correct the camera's pose in the "
+                          "robot file, or the table's place")
+    return scene if kept.all() else scene.of(kept)
+
+
+def at_seen_height(robot: Robot, obj: ObjectModel) -> Robot:
+    """The robot with its table at the height of the plane on which an object in the world stands.
+
+    Raises:
+        ObjectError: There is no such plane, or it is not level.
+        RobotError: The robot has no table.
+    """
+    table, plane = _table(robot, obj.name), obj.table
+    if plane is None or plane[2] < LEVEL:
+        tilt = "" if plane is None else f": the plane is tilted by {np.degrees(np.arccos(plane[2])):.0f} degrees"
+        raise ObjectError(f"the camera sees no level table below '{obj.name}'{tilt}; correct its pose in the robot file, or "
+                          "the table's place")
+    height = float((plane[3] - plane[:2] @ np.array(table.centre)) / plane[2])
+    return replace(robot, table=replace(table, height=height))
+
+
+def _table(robot: Robot, name: str) -> Table:
+    if robot.table is None:
+        raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
+                         "object's points alone")
+    return robot.table
+
+
+def _solid(points: Float[np.ndarray, "n 3"], table: float) -> list[ObjectModel]:
+    """What stands above a table of this height [m], solid down to it, as one thing; nothing for no points."""
+    points = points[points[:, 2] > table]
+    if not len(points):
+        return []
+    cells, column = np.unique(np.floor(points[:, :2] / VOXEL).astype(int), axis=0, return_inverse=True)
+    tops = np.full(len(cells), -np.inf)
+    np.maximum.at(tops, column.ravel(), points[:, 2])
+    heights = [np.arange(top, min(table, top - VOXEL), -VOXEL) for top in tops]
+    rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z]) for cell, z in zip(cells, heights, strict=True)]
+    solid = np.concatenate(rows).astype(np.float32)  # of any size, unlike what is grasped
+    return [ObjectModel("other things", solid, np.zeros_like(solid), solid.mean(0, dtype=np.float64), content_hash(solid))]

@@ -1,0 +1,205 @@
+"""Attempts: objects come to rest, what the camera sees of them, lifts, and their animation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import dro_grasp as dro
+from dro_grasp.arm.planning.physics import Deviation, LiftScene, object_name
+from dro_grasp.arm.planning.task import PlanConfig
+from dro_grasp.arm.planning.workcell import Workcell
+from dro_grasp.arm.tabletop import experiment as tabletop
+from dro_grasp.arm.tabletop.animation import Recorder, draw_animation
+from dro_grasp.arm.tabletop.camera_view import STRIDE, depth_image, thinned_intrinsics
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
+from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object
+from dro_grasp.arm.tabletop.table_setup import APART, other_objects, rest, scatter
+from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
+from dro_grasp.objects.perception.scan import depth_points
+from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.scenery import load_scene
+from dro_grasp.objects.shape import solid_of
+
+QUICK = TabletopConfig(
+    see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=8, best_seconds=30, planner_seconds=30))
+
+
+@pytest.fixture(scope="module")
+def can() -> dro.ObjectModel:
+    return dro.load_object("can")
+
+
+@pytest.fixture(scope="module")
+def scene(robot: dro.Robot, can: dro.ObjectModel) -> LiftScene:
+    scene = LiftScene(Workcell(robot), [can])
+    assert rest(scene, 0, TabletopConfig().region, np.random.default_rng(0))
+    return scene
+
+
+def test_the_robot_stays_at_home_and_an_object_comes_to_rest_on_the_table(scene: LiftScene, can: dro.ObjectModel) -> None:
+    assert np.abs(scene.joints()[0] - scene.robot.home).max() < 1e-3
+    vertices = np.asarray(can.vertices) @ scene.pose(0)[:3, :3].T + scene.pose(0)[:3, 3]
+    assert abs(vertices[:, 2].min()) < 2e-3
+    assert scene.touched(0) == 0
+
+
+def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    (depth, _), T = depth_image(scene, robot.camera, 0.0, 0), robot.camera.T_world_camera
+    row, column = np.meshgrid(np.arange(depth.shape[0]) * STRIDE, np.arange(depth.shape[1]) * STRIDE, indexing="ij")
+    pixels = np.stack([column, row, np.ones_like(row)], -1)
+    rays = pixels @ np.linalg.inv(robot.camera.intrinsics).T @ T[:3, :3].T
+    expected = -T[2, 3] / rays[..., 2]
+    seen = depth > 0
+    assert np.isclose(depth[seen], expected[seen], atol=1e-6).mean() > 0.8
+    assert (depth[seen] <= expected[seen] + 1e-6).all()
+
+
+def _picked(depth: np.ndarray, robot: dro.Robot) -> tuple[PickedObject, np.ndarray]:
+    """The only thing of a depth image, and its points in the camera's frame [m]."""
+    assert robot.camera is not None
+    view = load_scene(depth, camera=SceneCamera(robot.camera.T_world_camera, thinned_intrinsics(robot.camera)))
+    assert view.sight is not None
+    return pick_object(view, robot), view.sight.points[view.chosen().own]
+
+
+def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    assert robot.table is not None
+    (depth, mask), T = depth_image(scene, robot.camera, 0.0015, 1), robot.camera.T_world_camera
+    seen, points = _picked(depth, robot)
+    assert len(points) == pytest.approx(int(mask.sum()), rel=0.1)
+    assert seen.robot.table is not None
+    assert abs(seen.robot.table.height) < 1e-3
+    in_object = (points @ T[:3, :3].T + T[:3, 3] - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
+    distance = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs()
+    assert float(distance.median()) < 0.0015
+    assert float(distance.quantile(0.95)) < 0.005
+
+
+@pytest.mark.parametrize("name", ["structured_light", "time_of_flight", "stereo"])
+def test_the_table_has_the_noise_of_a_kind_of_camera(scene: LiftScene, robot: dro.Robot, name: NoiseName) -> None:
+    camera = robot.camera
+    assert camera is not None
+    (true, mask), T = depth_image(scene, camera, 0.0, 0), camera.T_world_camera
+    table = (true > 0) & ~mask
+    rays = depth_points(np.ones(true.shape), thinned_intrinsics(camera)).reshape(*true.shape, 3)
+    cosine = np.abs(rays @ T[2, :3]) / np.linalg.norm(rays, axis=-1)
+    there, error = np.zeros(true.shape, int), []
+    for seed in range(3):
+        depth, again = depth_image(scene, camera, name, seed)
+        assert np.array_equal(again, mask)
+        near = table & (depth > 0) & (np.abs(depth - true) < 0.02)
+        there += near
+        error.append(((depth - true) / PRESETS[name].deviation(np.maximum(true, 0.1), np.arccos(cosine)))[near])
+    assert np.concatenate(error).std() == pytest.approx(1.0, abs=0.1)
+    assert (there[table] > 0).mean() > 0.9
+    seen, points = _picked(depth, robot)
+    assert seen.robot.table is not None
+    assert abs(seen.robot.table.height) < 1e-3
+    assert len(points) == pytest.approx(int(mask.sum()), rel=0.25)
+
+
+def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    T, ahead = np.eye(4), np.array([0.1, 0.0, 0.2]) - (1.3, 0.0, 0.7)
+    T[:3, 2], T[:3, 0], T[:3, 3] = ahead / np.linalg.norm(ahead), (0, 1, 0), (1.3, 0.0, 0.7)
+    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+    depth, mask = depth_image(scene, replace(robot.camera, T_world_camera=T), 0.0, 0)
+    points = depth_points(depth, thinned_intrinsics(robot.camera)) @ T[:3, :3].T + T[:3, 3]
+    in_object = (points - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
+    on = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs().numpy() < 2e-3
+    assert (on | (np.abs(points[:, 2]) < 1e-3)).all()
+    assert (on[mask[depth > 0]]).all()
+    assert mask.sum() > 100
+    covered = np.linalg.inv(T) @ robot.T_world_wrist(robot.home)[:, 3]
+    column, row = ((thinned_intrinsics(robot.camera) @ covered[:3])[:2] / covered[2]).round().astype(int)
+    assert depth[row, column] == 0, "the hand is in view"
+
+
+def test_an_attempt_lifts_a_can_and_becomes_an_animation(
+    robot: dro.Robot, can: dro.ObjectModel, tmp_path: Path, compiled: list[mujoco.MjSpec]
+) -> None:
+    robot, recorder = replace(robot, home=robot.home - 1e-3), Recorder()  # no other test has this home
+    compiled.clear()
+    result = attempt(robot, can, 0, 0, dro.GraspPredictor(), QUICK, recorder)
+    assert result.stage == "done", result.reason
+    assert result.raised > 0.15
+    assert len(compiled) == 5, "the table of the attempt, beside the four models of a plan"
+    assert len(recorder.frames) == pytest.approx(10 * (result.motion_seconds + 1.0), abs=2)
+    recorder.frames = recorder.frames[::20]
+    draw_animation(robot, recorder, tmp_path / "lift.gif")
+    with Image.open(tmp_path / "lift.gif") as film:
+        assert film.n_frames == len(recorder.frames)  # type: ignore[attr-defined]
+
+
+@pytest.mark.slow
+def test_an_attempt_repeats(robot: dro.Robot, can: dro.ObjectModel) -> None:
+    first, second = (attempt(robot, can, 0, 0, dro.GraspPredictor(), QUICK) for _ in range(2))
+    assert (first.stage, first.raised, first.place) == (second.stage, second.raised, second.place)
+
+
+def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None:
+    can, config = dro.load_object("can"), TabletopConfig(clutter=2)
+    others = other_objects("can", 2, np.random.default_rng(0))
+    assert "can" not in {o.name for o in others}
+    scene = LiftScene(Workcell(robot), [can, *others])
+    assert scatter(scene, config.region, np.random.default_rng(1))
+    clouds = [o.cloud @ scene.pose(i)[:3, :3].T + scene.pose(i)[:3, 3] for i, o in enumerate(scene.objects)]
+    for i, cloud in enumerate(clouds):
+        assert abs(cloud[:, 2].min()) < 3e-3
+        for other in clouds[:i]:
+            assert np.linalg.norm(cloud[::20, None] - other[None, ::20], axis=-1).min() > APART / 3
+    with pytest.raises(dro.DroGraspError, match="clutter is 9"):
+        TabletopConfig(clutter=9)
+    with pytest.raises(dro.DroGraspError, match=r"region is \(0.5, 0.0, 0.4, 0.1\); give two corners"):
+        TabletopConfig(region=(0.5, 0.0, 0.4, 0.1))
+
+
+@pytest.mark.parametrize("see", ["mesh", "cloud"])
+def test_a_stated_mass_is_lifted_and_planned_for(
+    robot: dro.Robot, can: dro.ObjectModel, see: Literal["mesh", "cloud"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stands beside it keeps its own mass; the attempt ends where the plan would begin."""
+    known, scenes = [], []
+    honest = tabletop.scatter
+
+    def scattered(scene: LiftScene, *rest: Any) -> bool:
+        scenes.append(scene)
+        return honest(scene, *rest)
+
+    def unplanned(robot: dro.Robot, obj: dro.ObjectModel, *rest: Any, place: None) -> None:
+        known.append(obj)
+        raise dro.DroGraspError("not planned")
+
+    monkeypatch.setattr(tabletop, "scatter", scattered)
+    monkeypatch.setattr(tabletop, "plan", unplanned)
+    for mass in (0.4, None):
+        config = replace(QUICK, see=see, mass=mass, clutter=1)
+        made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)
+        assert made.reason == "not planned"
+        bodies = [scenes[-1].model.body(object_name(i)).mass[0] for i in range(2)]
+        assert bodies == pytest.approx([mass or can.mass, other_objects("can", 1, np.random.default_rng([0, 0, 1]))[0].mass])
+        assert known[-1].stated_mass == mass
+    assert solid_of(known[0]).mass == pytest.approx(0.4, rel=1e-6)
+
+
+def test_settings_go_through_labels_and_back() -> None:
+    heavy = TabletopConfig(mass=0.4)
+    assert TabletopConfig.from_label(heavy.label()) == heavy
+    assert "mass" not in TabletopConfig().label(), "attempts that were stored before masses could be stated stay valid"
+    assert TabletopConfig.from_label(TabletopConfig().label()) == TabletopConfig()
+    wanted = dro.Constraints((0.0, 0.0, -1.0), max_tilt=0.5, pregrasp_clearance=0.01)
+    config = TabletopConfig(plan=dro.PlanConfig(constraints=wanted))
+    assert TabletopConfig.from_label(config.label()) == config
+    assert config.label() != TabletopConfig().label()
+    heavier = TabletopConfig(plan=dro.PlanConfig(deviations=(Deviation((0.01, 0.0), 0.5, 2.0),)))
+    assert TabletopConfig.from_label(heavier.label()) == heavier
