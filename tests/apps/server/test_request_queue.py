@@ -173,6 +173,27 @@ def test_closing_refuses_what_waits() -> None:
         queue.submit(call("late"))
 
 
+def test_a_queue_is_closed_from_two_sides_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = RequestQueue(None, answerer=QuickAnswerer)
+    join, inside, most = made._pool.join, [0], [0]
+
+    def slow_join() -> None:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        time.sleep(0.1)
+        join()
+        inside[0] -= 1
+
+    monkeypatch.setattr(made._pool, "join", slow_join)
+    sides = [threading.Thread(target=made.close) for _ in range(2)]
+    for side in sides:
+        side.start()
+    for side in sides:
+        side.join(20)
+    assert most == [1] and inside == [0]
+    assert not is_alive(made.ready.process)
+
+
 def test_a_queue_that_closes_lets_what_is_computed_end_in_time_and_refuses_what_waits_at_once() -> None:
     queue = RequestQueue(None, answerer=QuickAnswerer)
     taken = [submitted(queue, "running", "nap"), queue.submit(call("queued"))]

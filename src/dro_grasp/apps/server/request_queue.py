@@ -154,7 +154,7 @@ class RequestQueue:
         self._hurry: Future[Reply] = Future()
         self._running: Request | None = None
         self._numbers = itertools.count(1)
-        self._lock = threading.Lock()
+        self._lock, self._ending = threading.Lock(), threading.Lock()
         self._turns = ThreadPoolExecutor(1, "requests")
         self._context = multiprocessing.get_context("spawn")
         self._cancelled = self._context.Value("Q", 0, lock=False)
@@ -329,9 +329,10 @@ class RequestQueue:
             raise
 
     def _end(self) -> None:
-        """End the process, whatever it does."""
-        self._pool.stop()
-        self._pool.join()
+        """End the process, whatever it does; one caller after the other, as a pool's pipes may be closed by one thread only."""
+        with self._ending:
+            self._pool.stop()
+            self._pool.join()
 
 
 def _was_killed(error: BaseException) -> bool:
