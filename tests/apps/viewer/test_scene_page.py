@@ -137,6 +137,14 @@ def test_a_click_takes_one_side_of_things_that_touch(page: ScenePage) -> None:
         assert page.predictor.asked[-1].constraints.obstacles is not None
     page._other()  # other grasps of the same side
     assert overlap(made, 1, page.offer.found.chosen.pixels) > 0.8
+    page.predictor.fails = True
+    aimed(page, np.array([0.0, 0.0, 0.06]))
+    assert page.offer is None
+    page.predictor.fails = False
+    aimed(page, np.array([0.0, 0.01, 0.06]))  # once more: other draws
+    assert page.offer is not None
+    assert page.offer.wish.seed == 1
+    assert overlap(made, 0, page.offer.found.chosen.pixels) > 0.8
     page.one_side.value = False
     aimed(page, np.array([0.07, 0.0, 0.155]))
     assert page.offer.wish.side is None

@@ -206,10 +206,7 @@ class ScenePage(Page):
         if row is None:
             self._tell(NOTHING_THERE)
         elif (label := int(cloud.labels[row])) >= 0:
-            if self.one_side.value:
-                self.pick(label, side=cloud.world[row])
-            else:
-                self._again(label)
+            self._again(label, cloud.world[row] if self.one_side.value else None)
         elif label == STRUCTURE:
             self._on_structure(cloud.world[row])
         else:
@@ -219,13 +216,15 @@ class ScenePage(Page):
         """A table, wall or board was clicked."""
         self._tell(STRUCTURE_THERE)
 
-    def _again(self, number: int) -> None:
-        """A thing was clicked, perhaps once more: then other grasps are made if there are none."""
+    def _again(self, number: int, side: Float[np.ndarray, "3"] | None) -> None:
+        """A thing, or one side of it, was clicked, perhaps once more: then other grasps are made if there are none."""
         wish = self._wish
-        if wish is None or wish.number != number or wish.side is not None:
-            self.pick(number)
+        if wish is None or wish.number != number or (wish.side is None) != (side is None):
+            self.pick(number, side=side)
         elif self.offer is None and wish is self._answered:
-            self.pick(number, wish.seed + 1)
+            self.pick(number, wish.seed + 1, side)
+        elif side is not None:  # perhaps the other one
+            self.pick(number, side=side)
         else:
             self._tell(f"**Thing {number + 1}** is taken already. *Other grasps* makes further ones.")
 
