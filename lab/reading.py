@@ -93,6 +93,17 @@ def mixed(used: dict[str, Cell]) -> list[str]:
     return found + [f"code of {name}" for name, digests in states.items() if len(digests) > 1]
 
 
+def state_of(what: str, used: dict[str, Cell]) -> str:
+    """The commits of what one row or table rests on, of which all has the same code and weights.
+
+    Raises:
+        ValueError: It has not.
+    """
+    if found := mixed(used):
+        raise ValueError(f"{what} would mix states: {', '.join(found)}; run `make results` for what is stale")
+    return ", ".join(sorted({cell["commit"] for cell in used.values()}))
+
+
 def percent(rate: Sequence[float]) -> str:
     """Success and its interval [%]."""
     return "-" if math.isnan(rate[0]) else f"{100 * rate[0]:.1f} [{100 * rate[1]:.0f}-{100 * rate[2]:.0f}]"

@@ -20,7 +20,7 @@ from lab import pages, targets
 from lab.benchmarks.report import ROOT
 from lab.figure import CONTROLS, FIGURE, METHODS, draw_figure, figure_data
 from lab.measurements import PAPER_HANDS, ROBOTS, SEEN_IN_PART
-from lab.reading import HEAD, MissingResult, Results, as_row, line, mixed, of, plain, select, table
+from lab.reading import HEAD, MissingResult, Results, as_row, line, of, plain, select, state_of, table
 from lab.robot_tables import any_grasp, lifted, planning, robot_tasks
 from lab.runner import RESULTS
 from lab.studies import payload
@@ -346,8 +346,7 @@ def writer(name: str, make: Callable[[Results], str], folder: Path = RESULTS) ->
         text = make(results)
     except MissingResult as missing:
         return f"not measured (`make results NAMES={missing}`)"
-    if found := mixed(results.used):
-        raise ValueError(f"{name} would mix states: {', '.join(found)}; run `make results` for what is stale")
+    state_of(name, results.used)
     return text
 
 

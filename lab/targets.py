@@ -18,7 +18,7 @@ from dro_grasp.compare.rows import Row, average
 from lab.benchmarks import gpu_table
 from lab.benchmarks.report import ROOT
 from lab.measurements import FLAT_THINGS, PAPER_HANDS, ROBOTS, STORED
-from lab.reading import MissingResult, Results, as_row, mixed, percent, plain, select, table
+from lab.reading import MissingResult, Results, as_row, percent, plain, select, state_of, table
 from lab.robot_tables import HOLD_NOISES, LIFTED, attempts, hold_rows
 
 PUBLISHED = ROOT / "lab" / "notebook" / "2026-11-published-hands.csv"
@@ -58,11 +58,9 @@ class Target:
             found = self.measure(own)
         except MissingResult:
             return [*start, "", "", "not measured"]
-        if states := mixed(own.used):
-            raise ValueError(f"'{self.what}' would mix states: {', '.join(states)}; run `make results` for what is stale")
-        commits = sorted({cell["commit"] for cell in own.used.values()})
+        commits = state_of(f"'{self.what}'", own.used)
         reached = found.value >= self.goal if self.least else found.value <= self.goal
-        return [*start, found.told, ", ".join(commits), "reached" if reached else "**not reached**"]
+        return [*start, found.told, commits, "reached" if reached else "**not reached**"]
 
 
 def rate(row: Row, protocol: str) -> Found:

@@ -64,6 +64,20 @@ def test_a_table_of_two_states_is_refused(tmp_path: Path, changes: dict) -> None
         tables.writer("constraints.cost", tables.constraints, tmp_path)
 
 
+def test_rows_of_what_robots_do_may_be_of_other_states_than_each_other(tmp_path: Path) -> None:
+    cells = json.loads((runner.RESULTS / "asked.json").read_text())["cells"]
+    other = {name: {**cell, "weights": {"more.safetensors": "0"}, "commit": "0123456789"} for name, cell in cells.items()}
+    (tmp_path / "asked.json").write_text(json.dumps({"cells": other}))
+    (tmp_path / "holding.json").write_text((runner.RESULTS / "holding.json").read_text())
+    rows = [line.split("|")[1:-1] for line in tables.writer("robots.tasks", tables.robot_tasks, tmp_path).splitlines()]
+    commits = {row[0]: row[-1] for row in rows[2:] if row[-1]}
+    holding = json.loads((tmp_path / "holding.json").read_text())["cells"]["allegro"]["commit"]
+    assert set(commits.values()) == {"0123456789", holding}
+    kept(tmp_path, "asked", {"code": {"src/dro_grasp/simulation": "0"}})
+    with pytest.raises(ValueError, match="asked for among three others.* would mix states"):
+        tables.writer("robots.tasks", tables.robot_tasks, tmp_path)
+
+
 def test_a_result_of_another_command_counts_as_not_measured(tmp_path: Path) -> None:
     kept(tmp_path, "constraints", {"command": "another"})
     assert tables.writer("constraints.cost", tables.constraints, tmp_path).startswith("not measured")

@@ -190,7 +190,7 @@ def test_a_queue_is_closed_from_two_sides_one_after_the_other(monkeypatch: pytes
         side.start()
     for side in sides:
         side.join(20)
-    assert most == [1] and inside == [0]
+    assert (most, inside) == ([1], [0])
     assert not is_alive(made.ready.process)
 
 
