@@ -73,8 +73,11 @@ def test_rows_of_what_robots_do_may_be_of_other_states_than_each_other(tmp_path:
     commits = {row[0]: row[-1] for row in rows[2:] if row[-1]}
     holding = json.loads((tmp_path / "holding.json").read_text())["cells"]["allegro"]["commit"]
     assert set(commits.values()) == {"0123456789", holding}
+
+
+def test_a_row_of_what_robots_do_is_of_one_state(tmp_path: Path) -> None:
     kept(tmp_path, "asked", {"code": {"src/dro_grasp/simulation": "0"}})
-    with pytest.raises(ValueError, match="asked for among three others.* would mix states"):
+    with pytest.raises(ValueError, match=r"asked for among three others.* would mix states: code of src/dro_grasp/simulation"):
         tables.writer("robots.tasks", tables.robot_tasks, tmp_path)
 
 

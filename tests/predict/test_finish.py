@@ -147,25 +147,6 @@ def test_rivals_stay_in_the_choice() -> None:
     assert finish(WHOLE, parts[1], config, 4, first).seconds["refine"] > first.seconds["refine"] > 0
 
 
-def test_what_cannot_be_carried_out_is_neither_settled_nor_returned() -> None:
-    made, asked = candidates(WHOLE, 12), list[int]()
-
-    def from_behind(grasps: GraspBatch) -> list[str]:
-        asked.append(len(grasps))
-        assert bool(grasps.pregrasp_joints.isfinite().all()), "complete"
-        return ["behind" if x < 0 else "" for x in grasps.T_object_wrist[:, 0, 3].tolist()]
-
-    limited = replace(WHOLE, reach=from_behind)
-    config = FinishConfig(settle=SettleConfig(share=1.0), least_confidence=0.0)
-    done, refined = finish(limited, made, config, keep=12), refine(WHOLE, made.grasps)
-    behind = refined.T_object_wrist[:, 0, 3] < 0
-    assert 0 < int(behind.sum()) < 12
-    assert asked == [12]
-    assert done.dropped == {TURNED: 2, "behind": int(behind.sum())}
-    same(done.pool, finish(WHOLE, made[~behind], config, keep=12).pool)
-    assert finish(limited, made[behind], config, keep=12).dropped["behind"] == int(behind.sum()) == asked[1]
-
-
 def test_of_equal_scores_the_one_that_was_proposed_first_is_kept() -> None:
     made = candidates(WHOLE, 3)
     twice = Candidates.concatenate([made, replace(made, origin=("late",) * 3)])

@@ -173,10 +173,9 @@ def finish_all(
     config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
     with watch("refine"):
         whole = _refined(problems, candidates, config)
-    with watch("rank"):
-        admission = [_admitted(problem, grasps, config.admission) for problem, grasps in zip(problems, whole, strict=True)]
-    allowed = [kept for kept, _ in admission]
-    dropped = [Counter({TURNED: own.turned}) + why for own, (_, why) in zip(candidates, admission, strict=True)]
+    allowed = [feasible(problem, grasps, config.admission) for problem, grasps in zip(problems, whole, strict=True)]
+    dropped = [Counter({TURNED: own.turned}) + count_violations(problem, grasps[~kept], config.admission)
+               for problem, own, grasps, kept in zip(problems, candidates, whole, allowed, strict=True)]
     with watch("rank"):
         refined = score_all(problems, [grasps[kept] for grasps, kept in zip(whole, allowed, strict=True)], config.score)
     admitted = [own[kept] for own, kept in zip(candidates, allowed, strict=True)]
@@ -231,19 +230,6 @@ def _refined(
         [problems[i] for i in rough], [candidates[i].grasps for i in rough], config.refine), strict=True))
     return [found[i] if i in found else complete(problem, own.grasps) for i, (problem, own) in enumerate(
         zip(problems, candidates, strict=True))]
-
-
-def _admitted(
-    problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig
-) -> tuple[Bool[Tensor, " n"], Counter[str]]:
-    """Which complete grasps respect the constraints and can be carried out, and how many others there are, by reason."""
-    kept = feasible(problem, grasps, config)
-    dropped = count_violations(problem, grasps[~kept], config)
-    if problem.reach is not None and bool(kept.any()):
-        faults = problem.reach(grasps[kept])
-        kept[kept.clone()] = torch.tensor([not fault for fault in faults])
-        dropped.update(fault for fault in faults if fault)
-    return kept, dropped
 
 
 def _settled(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,9 +20,6 @@ from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.optimize.grasp_energy import Clearance, EnergyConfig, GraspEnergy, Surroundings, Workspace
 from dro_grasp.optimize.starts import APPROACH
 from dro_grasp.predict.constraints import Constraints, lies_low
-
-Reach = Callable[[GraspBatch], Sequence[str]]
-"""What says of complete grasps, in the object's frame, why they cannot be carried out: a word of each; empty if it can."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +39,6 @@ class GraspProblem:
     """Where the network, the grasp energy and, on CUDA, the simulations of settling run."""
     constraints: Constraints = field(default_factory=Constraints)
     """What grasps have to respect."""
-    reach: Reach | None = None
-    """Which of those that do can be carried out, as by an arm; all, if it is None."""
     _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)
     _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
@@ -150,7 +145,7 @@ class GraspProblem:
 
     def beside(self, obj: ObjectModel) -> GraspProblem:
         """The problem of another object, with what is prepared of the hand shared."""
-        other = GraspProblem(self.hand, obj, self.device, self.constraints, self.reach)
+        other = GraspProblem(self.hand, obj, self.device, self.constraints)
         vars(other)["_thinned"] = self._thinned
         around = self.constraints.workspace(obj, self.hand_reach)
         vars(other)["_default_energy"] = self._default_energy.on(obj, around)

@@ -11,7 +11,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
-from dro_grasp.arm.planning.candidates import in_world
 from dro_grasp.arm.planning.reachability import (
     STEEPEST,
     TURNED,
@@ -24,8 +23,6 @@ from dro_grasp.arm.planning.reachability import (
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.predict.stages import complete
 from tests.helpers.claw_urdf import PALM, joint, link
 
 TURNS = '<limit lower="-2.4" upper="2.4" effort="5" velocity="2"/>'
@@ -106,21 +103,6 @@ def test_inverse_kinematics_reaches_what_forward_kinematics_reached_and_nothing_
     far = np.eye(4)
     far[0, 3] = robot.longest_reach
     assert solver.solve(far, seeds[:2]) is None
-
-
-def test_faults_of_grasps_are_those_of_their_ways(robot: dro.Robot) -> None:
-    can, T = dro.load_object("can"), np.eye(4)
-    T[:3, 3] = 0.5, 0.1, -can.cloud[:, 2].min()
-    problem = dro.GraspProblem(robot.hand, can)
-    grasps = in_world(complete(problem, palm_facing_starts(robot.hand, can, 24, 0)), T)
-    cell = Workcell(robot, [], can, T)
-    faults = Reachability(cell, ReachConfig(), 0).faults(grasps)
-    twin = Reachability(cell, ReachConfig(), 0)
-    hopeless = twin.hopeless(grasps)
-    ways = [hopeless.get(row) or twin.ways(grasps, row) for row in range(len(grasps))]
-    assert faults == [way if isinstance(way, str) else "" for way in ways]
-    assert len(set(faults)) > 2
-    assert "" in faults
 
 
 def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None:

@@ -45,8 +45,7 @@ def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator
             config.num, task.seed_of(batch), config.candidates, source=config.source,
             least_confidence=task.least_confidence(batch))
         if isinstance(directions, str) and directions == "all":
-            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)),
-                                   lambda grasps: task.reach.faults(in_world(grasps, T)))
+            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)))
             yield from (in_world(grasps, T) for grasps in predictor.rounds(problem, request))
         else:
             yield grasps_in_world(predictor, hand, obj, T, request, wanted, directions)

@@ -84,10 +84,9 @@ def plan(
     made = first_trusted(task, tries, grasps, predictor) or first_possible(task, tries)
     if made is not None:
         return made
-    if tries.shortage and not tries.made:
-        raise PlanError("; ".join([tries.shortage, *([task.advice(refused)] if (refused := task.reach.refused) else [])]))
-    raise PlanError(f"{grasps_and_dropped(tries.made, tries.counts)}, and none is left for '{obj.name}'; "
-                    f"{task.advice(tries.counts)}")
+    raise PlanError(tries.shortage if tries.shortage and not tries.made else (
+        f"{grasps_and_dropped(tries.made, tries.counts)}, and none is left for '{obj.name}'; "
+        f"{task.advice(tries.counts)}"))
 
 
 @dataclass

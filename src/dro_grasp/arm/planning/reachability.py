@@ -6,7 +6,6 @@ links. Grasps are asked for from there, and a wrist may be turned a little from 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -134,8 +133,6 @@ class Reachability:
         clouds = [thing.cloud for thing in cell.obstacles if thing.is_cloud]
         self._cloud = KDTree(np.concatenate(clouds)) if clouds else None
         self._fields = [thing.distance_field for thing in cell.obstacles if not thing.is_cloud]
-        self.refused = Counter[str]()
-        """How many grasps `faults` told off, by reason."""
 
     def hopeless(self, grasps: GraspBatch) -> dict[int, str]:
         """Rows of complete grasps in the world that need no inverse kinematics, and why: geometry of the hand alone decides."""
@@ -167,27 +164,8 @@ class Reachability:
             nearest = torch.minimum(nearest, torch.from_numpy(apart).to(nearest) - VOXEL / 2)
         return nearest
 
-    def faults(self, grasps: GraspBatch) -> list[str]:
-        """Why the arm cannot take complete grasps in the world, wherever they would be put; empty for those that it can."""
-        hopeless = self.hopeless(grasps)
-        taken = (hopeless.get(row) or self._taken(grasps, row) for row in range(len(grasps)))
-        faults = [fault if isinstance(fault, str) else "" for fault in taken]
-        self.refused.update(fault for fault in faults if fault)
-        return faults
-
     def ways(self, grasps: GraspBatch, index: int) -> Feasible | str:
         """One grasp with configurations from standoff to lift, and to a place if there are any; or why there are none."""
-        found = self._taken(grasps, index)
-        if isinstance(found, str) or self.places is None:
-            return found
-        T = grasps.T_object_wrist[index:index + 1]
-        ahead = (T[0, :3, :3].T @ self.cell.robot.hand.palm_directions(T)[0]).double().numpy()
-        T_grasp = self.cell.robot.T_world_wrist(found.approach[-1])
-        put = self._way_to_place(found, T_grasp, ahead, Postures.of(self.cell.robot, grasps, index))
-        return Fault.NO_PLACE if put is None else replace(found, put=put)
-
-    def _taken(self, grasps: GraspBatch, index: int) -> Feasible | str:
-        """One grasp with configurations from standoff to lift, or why there are none."""
         robot = self.cell.robot
         T = grasps.T_object_wrist[index].double().numpy()
         ahead = robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
@@ -200,7 +178,11 @@ class Reachability:
                 continue
             outcome = self._through(q, back, up, postures)
             if not isinstance(outcome, str):
-                return Feasible(index, *outcome)
+                found = Feasible(index, *outcome)
+                if self.places is None:
+                    return found
+                put = self._way_to_place(found, robot.T_world_wrist(found.approach[-1]), T[:3, :3].T @ ahead, postures)
+                return Fault.NO_PLACE if put is None else replace(found, put=put)
             reasons.append(outcome)
         return max(reasons, key=(Fault.OUT_OF_REACH, Fault.COLLIDES, Fault.NO_LINE, Fault.NO_LIFT).index)
 
