@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.arm.clearing import trial as clearing_trial
 from dro_grasp.arm.clearing.loop import Cleared, Pick
 from dro_grasp.arm.clearing.trial import ClearTrial, ClearTrialConfig
 from dro_grasp.cli.main import main
@@ -31,7 +30,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, tuple[str, ...], 
         judged = (("held", True), ("empty", True))
         return ClearTrial(names, removed, (False,) * len(names), Cleared((lost, *done), (lost,)), judged)
 
-    monkeypatch.setattr(clearing_trial, "clear_trial", trial)
+    monkeypatch.setattr("dro_grasp.arm.clearing.trial.clear_trial", trial)
     return asked
 
 

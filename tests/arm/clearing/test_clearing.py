@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.arm.clearing import loop as clearing
+from dro_grasp.arm.clearing import loop
 from dro_grasp.arm.clearing.loop import Bin, ClearConfig, Pick, clear_table
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.planning.placing import Place
@@ -99,7 +99,7 @@ def world(monkeypatch: pytest.MonkeyPatch, robot: dro.Robot, placed: MotionPlan)
             return judged("held" if held else "empty")
 
         table.holds_twice, table.falls = False, {}
-        monkeypatch.setattr(clearing, "plan", planned)
+        monkeypatch.setattr(loop, "plan", planned)
         monkeypatch.setattr(MotionPlan, "check_hold", check)
         return table, asked
 
@@ -194,14 +194,14 @@ def test_a_pick_counts_only_when_the_thing_is_gone(world: Any, robot: dro.Robot,
 def test_of_two_that_touch_one_is_picked_where_both_cannot_be(world: Any, robot: dro.Robot) -> None:
     table, asked = world([True] * 4)
     table.there = {"a": (0.45, 0.0), "b": (0.51, 0.0)}
-    honest = clearing.plan
+    honest = loop.plan
 
     def planned(robot: dro.Robot, obj: dro.ObjectModel, **given: Any) -> MotionPlan:
         if np.ptp(obj.cloud[:, 0]) > 0.09:
             raise PlanError("too large")
         return honest(robot, obj, **given)
 
-    clearing.plan = planned  # taken back with the fixture's
+    loop.plan = planned  # taken back with the fixture's
     result = clear_table(robot, table, NOBODY)
     assert [pick.stage for pick in result.picks] == ["done", "done"]
     assert {own.name for own in asked} == {"a", "b"}

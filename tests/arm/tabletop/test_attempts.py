@@ -16,7 +16,7 @@ import dro_grasp as dro
 from dro_grasp.arm.planning.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.workcell import Workcell
-from dro_grasp.arm.tabletop import experiment as tabletop
+from dro_grasp.arm.tabletop import experiment
 from dro_grasp.arm.tabletop.animation import Recorder, draw_animation
 from dro_grasp.arm.tabletop.camera_view import STRIDE, depth_image, thinned_intrinsics
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
@@ -170,7 +170,7 @@ def test_a_stated_mass_is_lifted_and_planned_for(
 ) -> None:
     """What stands beside it keeps its own mass; the attempt ends where the plan would begin."""
     known, scenes = [], []
-    honest = tabletop.scatter
+    honest = experiment.scatter
 
     def scattered(scene: LiftScene, *rest: Any) -> bool:
         scenes.append(scene)
@@ -180,8 +180,8 @@ def test_a_stated_mass_is_lifted_and_planned_for(
         known.append(obj)
         raise dro.DroGraspError("not planned")
 
-    monkeypatch.setattr(tabletop, "scatter", scattered)
-    monkeypatch.setattr(tabletop, "plan", unplanned)
+    monkeypatch.setattr(experiment, "scatter", scattered)
+    monkeypatch.setattr(experiment, "plan", unplanned)
     for mass in (0.4, None):
         config = replace(QUICK, see=see, mass=mass, clutter=1)
         made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)

@@ -11,7 +11,6 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.arm.tabletop import run as tabletop_run
 from dro_grasp.arm.tabletop.attempts import Attempt, endings, failures, read_attempts, write_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
@@ -71,7 +70,7 @@ def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
     whole, half = dro.load_object(box), trimesh.creation.box((0.025, 0.05, 0.08))
     halves = tuple((np.add(half.vertices, [x, 0, 0]), half.faces) for x in (-0.0125, 0.0125))
     with monkeypatch.context() as patch:
-        patch.setattr(tabletop_run, "load_object", lambda source: replace(whole, exact_parts=halves))
+        patch.setattr("dro_grasp.arm.tabletop.run.load_object", lambda source: replace(whole, exact_parts=halves))
         with pytest.raises(OptionError, match=rf"'{box}' is not the object 'textured' .* as it was then"):
             run_tabletop(TabletopRun(small_robot, (box,), attempts=1, config=QUICK), output)
     trimesh.creation.box((0.04, 0.05, 0.08)).export(box)
