@@ -265,8 +265,7 @@ def trusted(task: Task, tries: Tries, whole: bool) -> list[Feasible]:
     def enough(number: int) -> bool:
         if task.rehearsal is None:
             return config.order == "random" or score[number] >= config.trusted_score
-        least, surely = (config.trusted_share, -math.inf) if whole else (1.0, config.sure_score)
-        return tries.share[number] >= least and score[number] >= surely
+        return tries.share[number] >= (config.trusted_share if whole else 1.0)
 
     ready = tries.taken()
     tries.ready = [goal for goal in ready if not enough(goal.index)]

@@ -55,8 +55,6 @@ class PlanConfig(Checked):
     """Coefficient of friction between hand, object and table, for rehearsals."""
     deviations: tuple[Deviation, ...] = DEVIATIONS
     """How the rehearsals of one grasp deviate from what is known."""
-    sure_score: float = -0.85
-    """Log-odds of holding from which on a grasp that holds in all of its rehearsals is taken at once."""
     trusted_share: float = 0.5
     """Share of its rehearsals in which a grasp should hold the object after the whole of a batch."""
     trusted_score: float = 1.0
