@@ -28,9 +28,18 @@ RECORDED = Path(__file__).parent / "recorded.json"
 Numbers = dict[str, list[float]]
 
 
+def vendor() -> str:
+    """Who made the processor, as Linux tells: libraries of linear algebra have kernels by maker; empty elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("vendor_id")), "")
+
+
 def machine() -> dict[str, str]:
     """What decides on the last bits of a result, beside the code."""
-    return {"processor": platform.machine(), "vector unit": torch.backends.cpu.get_cpu_capability(),
+    return {"processor": platform.machine(), "vendor": vendor(), "vector unit": torch.backends.cpu.get_cpu_capability(),
             "torch": torch.__version__.split("+")[0], "mujoco": str(mujoco.__version__), "numpy": np.__version__}
 
 
