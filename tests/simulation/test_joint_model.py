@@ -13,10 +13,8 @@ import torch
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import TABLE
-from dro_grasp.grasps.controller import complete
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
-from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import gives_way
 from dro_grasp.predict.settling import SettleConfig, physics, settle_all, weigh_settled_all
@@ -30,19 +28,17 @@ from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
 from dro_grasp.simulation.trial import hand_shift, settle, settle_many, simulate, simulate_many
 from dro_grasp.simulation.weighing import WeighingConfig, weigh, weigh_many
 from dro_grasp.simulation.worlds import WARP
-from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.steady_grasps import HAND, WANTED, steady_grasps
 from tests.helpers.warp_steps import Steps, take_absent_shapes_away
 
-HAND = loaded_hand("gripper3")
-OBJECTS = [load_object(name) for name in ("can", "rubber_duck", "cube")]
+OBJECTS = [load_object(name) for name in WANTED]
 """One, four, and one part; the cube's inertia is along its own axes."""
 
 
 @pytest.fixture(scope="module")
 def batches() -> list[GraspBatch]:
-    """Grasps of each, most of which hold."""
-    return [complete(HAND, synthesize(HAND, obj, num, 0, SynthesisConfig(steps=40)), torch.as_tensor(obj.centre_of_mass))
-            for obj, num in zip(OBJECTS, (3, 2, 4), strict=True)]
+    """Three, two and four grasps; five of them hold."""
+    return steady_grasps()
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.predict import settling
 from dro_grasp.simulation import rollout as rollout_module, trial as trial_module, warp_worlds, worlds as worlds_module
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
 from dro_grasp.simulation.joint_model import joint_model
@@ -40,6 +41,7 @@ from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.worker import EngineConfig, Wanted
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.fake_device import fake_device
+from tests.helpers.steady_grasps import steady_grasps
 from tests.helpers.warp_steps import State, Steps
 
 
@@ -311,14 +313,19 @@ def test_without_a_device_nothing_is_judged_twice(hand: Hand, obj: ObjectModel, 
     assert (valid, refuted, count) == (grasps, {}, 0)
 
 
-@pytest.mark.parametrize(("resettle", "tolerance"), [(False, 1e-4), (True, 0.02)])
+@pytest.mark.parametrize("resettle", [False, True])
 def test_a_shard_made_on_a_device_is_that_of_the_processor(
-    steps: Callable[..., Steps], monkeypatch: pytest.MonkeyPatch, resettle: bool, tolerance: float
+    steps: Callable[..., Steps], monkeypatch: pytest.MonkeyPatch, resettle: bool
 ) -> None:
-    """From drawn starts to confirmed grasps of two objects, with a strict device for PyTorch and MuJoCo in Warp's place.
+    """From candidates to confirmed grasps of two objects, with a strict device for PyTorch and MuJoCo in Warp's place.
 
-    Settling has no solver of residual slip on a device, which moves fingers by a hundredth.
+    What settles is stored, since settling carries small differences far. It has no solver of residual slip on a device, and
+    here on the processor neither.
     """
+    if resettle:
+        steady = {grasps.object[0]: grasps[grasps.energy.argsort()] for grasps in steady_grasps()}
+        monkeypatch.setattr(worker, "synthesize_all", lambda lots: [steady[lot.obj.name] for lot in lots])
+        monkeypatch.setattr(settling, "physics", lambda config, device: replace(protocol(config.protocol), noslip=0))
     made, hand, cube, can = steps(), load_hand("gripper3"), load_object("cube"), load_object("can")
     config = EngineConfig("strict", also=("dro",), candidates=24, resettle=resettle, confirm=0.5, synthesis=SynthesisConfig(
         steps=60, batch_size=24, at_once=48))
@@ -338,5 +345,5 @@ def test_a_shard_made_on_a_device_is_that_of_the_processor(
         assert told.failures == known.failures
         torch.testing.assert_close(found.energy, expected.energy, rtol=1e-3, atol=1e-4)
         for name in ("T_object_wrist", "joints"):
-            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0.0, atol=tolerance)
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0.0, atol=1e-4)
         assert found.protocol == expected.protocol
