@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import dro_grasp as dro
 import dro_grasp.arm.robots.robot as dro_robot
 from dro_grasp.arm.planning.motion import STAGES, MotionPlan
+from dro_grasp.arm.planning.physics import Deviation
 from dro_grasp.arm.planning.planner import ALIKE, ALIKE_TURN, failed_before, plan
 from dro_grasp.arm.planning.task import PlanConfig, Task
 from dro_grasp.arm.planning.workcell import Workcell, arm_addresses, robot_spec
@@ -85,6 +86,26 @@ def test_a_plan_has_the_forces_of_its_grasp(robot: dro.Robot, standing: tuple[dr
     np.testing.assert_allclose(made.notes.squeeze_torque, 0.01 * joints, rtol=1e-5, atol=1e-8)
     assert made.notes.payload == pytest.approx(np.abs(joints).sum(), rel=1e-5)
     assert made.notes.squeeze_force == 6.25
+
+
+@pytest.mark.parametrize(("weight", "asked"), [(1.0, 1), (100.0, 3)])
+def test_what_holds_in_all_rehearsals_is_taken_at_once_though_its_score_is_low(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], weight: float, asked: int
+) -> None:
+    """What lets go in one of two is taken only once a batch has no more grasps."""
+    shown = []
+
+    class Doubting(dro.GraspPredictor):
+        def rounds(self, *arguments: Any) -> Iterator[dro.GraspBatch]:
+            made = next(iter(super().rounds(*arguments)))
+            for _ in range(3):
+                shown.append(len(made))
+                yield made.replace(score=torch.full((len(made),), -3.0))
+
+    made = plan(robot, *standing, predictor=Doubting(), seed=0, config=PlanConfig(
+        num=12, deviations=(Deviation(), Deviation(weight=weight))))
+    assert len(shown) == asked
+    assert made.notes.score == -3
 
 
 def test_the_check_above_sees_a_plan_that_goes_through_the_wall(
