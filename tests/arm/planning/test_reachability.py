@@ -18,11 +18,13 @@ from dro_grasp.arm.planning.reachability import (
     Reachability,
     ReachConfig,
     WristSolver,
+    lowest_points,
     reachable_directions,
 )
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.optimize.grasp_energy import PRESSED
 from tests.helpers.claw_urdf import PALM, joint, link
 
 TURNS = '<limit lower="-2.4" upper="2.4" effort="5" velocity="2"/>'
@@ -119,3 +121,18 @@ def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None
     for thing in (obstacle, dro.load_object("cube")):
         reach = Reachability(Workcell(replace(robot, table=None), [thing], obj, T), ReachConfig(), 0)
         assert reach.hopeless(grasps) == ({0: Fault.HITS_OBSTACLE} if thing is obstacle else {})
+
+
+def test_where_a_squeeze_aims_counts_as_higher(robot: dro.Robot) -> None:
+    """Since the table stops it; of the same hand in grasp or pregrasp each millimetre counts."""
+    assert robot.table is not None
+    hand, wrist = robot.hand, torch.eye(4)[None].clone()
+    high, low = (hand.canonical_joints(share)[None] for share in (0.0, 1.0))
+    wrist[:, :3, 3] = torch.tensor([0.5, 0.0, 0.3])
+    lowest = {q: float(hand.points(q, wrist)[..., 2].min()) for q in (high, low)}
+    assert lowest[low] + PRESSED < lowest[high]
+    grasps = dro.GraspBatch.create(hand, dro.load_object("can"), wrist, high).replace(
+        pregrasp_joints=high, squeeze_joints=high)
+    for given, height in (({}, lowest[high]), ({"joints": low}, lowest[low]), ({"pregrasp_joints": low}, lowest[low]),
+                          ({"squeeze_joints": low}, lowest[low] + PRESSED)):
+        assert float(lowest_points(hand, grasps.replace(**given), robot.table)) == pytest.approx(height, abs=1e-6)

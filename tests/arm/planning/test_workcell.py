@@ -11,16 +11,19 @@ import torch
 import trimesh
 import yaml
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 from dro_grasp.arm.planning.candidates import grasps_in_world
 from dro_grasp.arm.planning.physics import LiftScene
-from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.arm.planning.workcell import VOXEL, Workcell, occupied, scene_solid
+from dro_grasp.arm.planning.reachability import WristSolver
+from dro_grasp.arm.planning.task import PlanConfig, Task
+from dro_grasp.arm.planning.workcell import TABLE, VOXEL, Workcell, occupied, scene_solid
 from dro_grasp.arm.robot_check import check_robot
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.cli.main import main
 from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.optimize.grasp_energy import PRESSED
 
 
 def test_boxes_of_a_cloud_fill_its_cells_and_nothing_else() -> None:
@@ -65,6 +68,47 @@ def test_an_arm_that_dips_into_the_table_collides_with_it_and_with_nothing_else(
     assert found
     assert {"table"} == {name for c in found for name in (c.first, c.second) if "/" not in name}
     assert not Workcell(replace(robot, table=None)).contacts(down, robot.open_hand)
+
+
+def lowered(robot: dro.Robot, depth: float) -> np.ndarray:
+    """The arm with the palm facing down and the lowest link of the open hand so deep in the table [m]."""
+    cell, solver = Workcell(robot), WristSolver(Workcell(robot))
+    assert robot.table is not None
+    palm = robot.hand.palm_direction_wrist.double().numpy()
+    T = np.eye(4)
+    T[:3, :3] = Rotation.align_vectors([[0, 0, -1]], [palm])[0].as_matrix()
+    low = float((robot.hand.points(torch.from_numpy(robot.open_hand).float()).double().numpy() @ T[:3, :3].T)[:, 2].min())
+    T[:3, 3] = 0.5, 0.0, robot.table.height - 0.01 - low
+    for _ in range(2):  # the surface of the shapes is not quite where points are
+        q = solver.solve(T, [robot.home])
+        assert q is not None
+        T[2, 3] -= depth + min(contact.distance for contact in cell.contacts(q, robot.open_hand))
+    return solver.solve(T, [q])
+
+
+def test_a_squeeze_may_aim_into_the_table_but_not_a_hand_be_there(robot: dro.Robot, wall: dro.ObjectModel) -> None:
+    """Nor may it aim deeper than PRESSED, or into an obstacle."""
+    shallow, deep = lowered(robot, 0.01), lowered(robot, PRESSED + 0.002)
+    cell = Workcell(robot)
+    assert {name for c in cell.contacts(shallow, robot.open_hand) for name in (c.first, c.second) if "/" not in name} == {TABLE}
+    assert not cell.free(shallow, robot.open_hand)
+    assert cell.free(shallow, robot.open_hand, aimed=True)
+    assert not cell.free(deep, robot.open_hand, aimed=True)
+    beside = wall.cloud - wall.cloud.mean(0) + robot.hand.points(
+        torch.from_numpy(robot.open_hand).float(), torch.from_numpy(robot.T_world_wrist(shallow)).float()).mean(0).numpy()
+    obstacle = dro.load_object(beside, keep_table=True)
+    assert not Workcell(robot, [obstacle]).free(shallow, robot.open_hand, aimed=True)
+
+
+@pytest.mark.parametrize(("high", "low"), [(0.034, True), (0.036, False)])
+def test_fingertips_may_touch_the_table_beside_what_is_low(robot: dro.Robot, high: float, low: bool) -> None:
+    """As where grasps are made; else such grasps would all be dropped."""
+    obj, T = dro.load_object(trimesh.creation.box(extents=(0.05, 0.05, high))), np.eye(4)
+    T[:3, 3] = 0.5, 0.1, high / 2
+    task = Task.of(robot, obj, T, (), PlanConfig(), 0)
+    assert (task.reach.config.table_margin, task.reach.config.clearance) == ((-0.001, 0.0) if low else (0.002, 0.001))
+    asked = Task.of(robot, obj, T, (), PlanConfig(constraints=dro.Constraints(touch_table=not low)), 0)
+    assert asked.touches_table == (not low)
 
 
 def test_a_carried_object_hits_obstacles_and_leaves_the_table_in_peace(robot: dro.Robot, wall: dro.ObjectModel) -> None:

@@ -24,6 +24,7 @@ from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
+from dro_grasp.optimize.grasp_energy import PRESSED
 
 TURNED = 0.12  # Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)
 LOWERED = 0.08  # Height from which an object is lowered straight [m] (ours)
@@ -191,7 +192,8 @@ class Reachability:
     ) -> tuple[Float[np.ndarray, "k n_arm"], Float[np.ndarray, "m n_arm"]] | str:
         """Approach and lift through one configuration of the grasp, or why there are none."""
         free, clearance = self.cell.free, self.config.clearance
-        if not all(free(q, posture, clearance, touch=True) for posture in hand.closing):
+        closed = all(free(q, posture, clearance, touch=True) for posture in (hand.pregrasp, hand.grasp))
+        if not closed or not free(q, hand.squeeze, clearance, touch=True, aimed=True):
             return Fault.COLLIDES
         retreat = self.solver.follow(back, q)
         if retreat is None or not all(free(x, hand.pregrasp, clearance, touch=True) for x in retreat):
@@ -201,7 +203,7 @@ class Reachability:
             return Fault.NO_LINE
         raised = self.solver.follow(up, q)
         if raised is None or not all(
-                free(x, hand.squeeze, clearance, carried(up[i], up[0]), touch=True) for i, x in enumerate(raised)):
+                free(x, hand.squeeze, clearance, carried(up[i], up[0]), touch=True, aimed=True) for i, x in enumerate(raised)):
             return Fault.NO_LIFT
         return retreat[::-1].copy(), raised
 
@@ -245,14 +247,14 @@ class Reachability:
         assert places is not None
         T, kept = robot.T_world_wrist(q), -places.allowed - TILTED
         moved = carried(T, T_grasp)
-        if not free(q, hand.squeeze, clearance, moved, touch=True, kept=kept):
+        if not free(q, hand.squeeze, clearance, moved, touch=True, kept=kept, aimed=True):
             return None
         height = min(LOWERED, self.config.lift)
         up, back = self._line(T, np.array([0, 0, height])), self._line(T, -self.config.standoff * ahead)
         raised = self.solver.follow(up, q)
         if raised is None or not free(raised[-1], hand.squeeze, moved=carried(up[-1], T_grasp), touch=True, kept=CARRIED):
             return None
-        if not all(free(x, hand.squeeze, clearance, carried(up[i], T_grasp), touch=True, kept=kept)
+        if not all(free(x, hand.squeeze, clearance, carried(up[i], T_grasp), touch=True, kept=kept, aimed=True)
                    for i, x in enumerate(raised)):
             return None
         released = self._released(q, moved, hand, kept)
@@ -359,9 +361,14 @@ def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int 
 
 
 def lowest_points(hand: Hand, grasps: GraspBatch, table: Table) -> Float[Tensor, " n"]:
-    """Height of the hand's lowest point over the table in pregrasp, grasp and squeeze of complete grasps in the world [m]."""
+    """Height of the hand's lowest point over the table in pregrasp, grasp and squeeze of complete grasps in the world [m].
+
+    In squeeze it counts as PRESSED higher: that is where joints aim, and the table stops them.
+    """
     postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
-    points = torch.stack([hand.points(q, grasps.T_object_wrist) for q in postures], 1).flatten(1, 2)
+    points = torch.stack([hand.points(q, grasps.T_object_wrist) for q in postures], 1)
+    points[:, 2, :, 2] += PRESSED
+    points = points.flatten(1, 2)
     over = ((points[..., :2] - torch.tensor(table.centre)).abs() < torch.tensor(table.size) / 2).all(-1)
     return torch.where(over, points[..., 2], torch.inf).amin(-1)
 

@@ -21,15 +21,17 @@ from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED
+from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, AdmissionConfig
 from dro_grasp.predict.config import AUTO
-from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.constraints import LOW, Constraints
 from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.sources.source import Source
 
 Directions = Literal["paper", "all"]  # Palm directions that are asked for
 ASSUMED_EXTENT = 1.2  # Largest edge of a table that no robot file states [m] (ours)
 BASE_ROOM = 0.15  # Distance of its edge from the middle of the arm's base, where that is possible [m] (ours)
+TIPS_DOWN = AdmissionConfig().least_tip_height
+"""Height over the table that fingertips keep which may touch it [m], as where grasps are made."""
 SURROUNDS = 0.1  # Least distance of its edge from what stands on it [m] (ours)
 
 
@@ -143,6 +145,18 @@ class Task:
         return None if self.robot.table is None else self.robot.table.height
 
     @property
+    def top(self) -> float:
+        """Height of the object's highest point [m]."""
+        return float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
+
+    @property
+    def touches_table(self) -> bool:
+        """Whether fingertips may touch the table: as in `Constraints.touch_table`."""
+        if (asked := self.constraints.touch_table) is not None:
+            return asked
+        return self.height is not None and self.top - self.height < LOW
+
+    @property
     def distance(self) -> float:
         """From the arm's base to the object's middle, along the ground [m]."""
         middle = self.T[:2, :3] @ self.obj.cloud.mean(0) + self.T[:2, 3]
@@ -155,7 +169,10 @@ class Task:
     @cached_property
     def reach(self) -> Reachability:
         """Inverse kinematics, with its own draws."""
-        return Reachability(self.cell, self.config.reach, self.seed, self.places)
+        config = self.config.reach
+        if self.touches_table:
+            config = replace(config, table_margin=min(config.table_margin, TIPS_DOWN), clearance=min(config.clearance, 0.0))
+        return Reachability(self.cell, config, self.seed, self.places)
 
     @cached_property
     def places(self) -> Places | None:
@@ -183,10 +200,9 @@ class Task:
         """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
         if self.config.constraints != Constraints():
             self.config.constraints.require_fit(moved(self.obj, self.T))
-        top = float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
-        if self.height is not None and top <= self.height:
-            raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
-                            "the object in the robot's world frame (camera=..., pose=...), or correct `table` in the "
+        if self.height is not None and self.top <= self.height:
+            raise PlanError(f"object '{self.obj.name}' ends at z = {self.top:.3f} m, below the table at {self.height:.3f} m; "
+                            "give the object in the robot's world frame (camera=..., pose=...), or correct `table` in the "
                             "robot file")
         if self.distance > (longest := self.robot.longest_reach):
             raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "

@@ -141,8 +141,8 @@ def _lifting(
     free = clear(reach) and all(
         cell.free(standoff, posture, 0.0) for posture in shape.position) and all(
         cell.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
-        cell.free(grasp, posture, 0.0, touch=True) for posture in close.position) and all(
-        cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
+        cell.free(grasp, posture, 0.0, touch=True, aimed=True) for posture in close.position) and all(
+        cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True, aimed=True) for q in lift.position)
     if not free:
         return None
     return [(reach, still(hand.opened, reach)), (still(standoff, shape), shape), (approach, still(hand.pregrasp, approach)),
@@ -162,8 +162,9 @@ def _placing(
     fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
 
     def clear(way: Trajectory, kept: float) -> bool:
-        return all(cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), put.T_grasp), touch=True, kept=kept)
-                   for q in way.position)
+        return all(
+            cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), put.T_grasp), touch=True, kept=kept, aimed=True)
+            for q in way.position)
 
     carry = smooth(waypoints, *gentle, STEP)
     if not clear(carry, CARRIED / 2):  # it leaves the straight edges that were planned
@@ -173,8 +174,9 @@ def _placing(
     back = smooth(put.retreat, *limits, RETREAT_SECONDS)
     opening = smooth(np.stack([put.released, hand.opened]), *fingers, STEP)
     place, end = put.lower[-1], put.retreat[-1]
-    free = clear(carry, CARRIED / 2) and clear(lower, put.kept) and all(
-        cell.free(place, posture, 0.0, put.moved, touch=True, kept=put.kept) for posture in release.position) and all(
+    opens = all(
+        cell.free(place, posture, 0.0, put.moved, touch=True, kept=put.kept, aimed=True) for posture in release.position)
+    free = clear(carry, CARRIED / 2) and clear(lower, put.kept) and opens and all(
         cell.free(q, put.released, 0.0, put.moved, touch=True, kept=put.kept) for q in back.position) and all(
         cell.free(end, posture, 0.0, put.moved, kept=put.kept) for posture in opening.position)
     if not free:

@@ -22,6 +22,7 @@ from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.hands.description.compiling import collide
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize.grasp_energy import PRESSED
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import HULL_VERTICES, MEMORY, PREFIX, attach, hand_spec, joint_addresses, let_touch
 
@@ -150,7 +151,7 @@ class Workcell:
 
     def contacts(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = 0.0,
-        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None, aimed: bool = False,
     ) -> list[Contact]:
         """What collides.
 
@@ -160,18 +161,19 @@ class Workcell:
             touch: The hand may touch the object.
             kept: Distance that the moved object keeps from table and obstacles [m], at most CARRIED and negative where it may
                 stand in them; by default as where it stood, and SINK less.
+            aimed: The hand's joints are where it is told to squeeze to: it may be PRESSED deep in the table, which stops it.
         """
         pairs, distance = self._detect(arm, hand, moved)
-        bad = self._bad(pairs, distance, clearance, moved is not None, touch, kept)
+        bad = self._bad(pairs, distance, clearance, moved is not None, touch, kept, aimed)
         return [Contact(self._name(a), self._name(b), d)
                 for (a, b), d in zip(pairs[bad].tolist(), distance[bad].tolist(), strict=True)]
 
     def free(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = CLEARANCE,
-        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None, aimed: bool = False,
     ) -> bool:
         """Whether nothing collides; arguments as for `contacts`."""
-        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept).any()
+        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept, aimed).any()
 
     def beside(self, moved: Float[np.ndarray, "4 4"] | None = None) -> list[tuple[float, str]]:
         """Signed distances of the object, here or moved, to table and obstacles near it, with their names [m]."""
@@ -202,12 +204,15 @@ class Workcell:
 
     def _bad(
         self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, moved: bool, touch: bool,
-        kept: float | None = None,
+        kept: float | None = None, aimed: bool = False,
     ) -> Bool[np.ndarray, " k"]:
         low, high = np.sort(self._part[pairs], axis=1).reshape(-1, 2).T
         bad = distance < np.where(high <= Part.HAND, 0.0, clearance)
         if touch:
             bad &= (high != Part.OBJECT) | (low != Part.HAND)
+        if aimed and self.robot.table is not None:
+            stops = (low == Part.HAND) & (high == Part.SURROUNDINGS) & (pairs == self.model.geom(TABLE).id).any(1)
+            bad &= ~stops | (distance < -PRESSED)
         beside = (high == Part.OBJECT) & (low == Part.SURROUNDINGS)
         return np.where(beside, moved & (distance < (self.resting - SINK if kept is None else kept)), bad)
 
