@@ -17,7 +17,7 @@ from dro_grasp.arm.flat.grips import flat_grasps, overhangs
 from dro_grasp.arm.flat.plans import plan_or_slide
 from dro_grasp.arm.flat.postures import AHEAD, OVER, WorkingHand, flat_grips
 from dro_grasp.arm.flat.sliding import SlideConfig, pushes, slide
-from dro_grasp.arm.flat.things import flat_object, overhang, seen_flat
+from dro_grasp.arm.flat.things import flat_object, overhang, seen_flat, width_of
 from dro_grasp.arm.planning.motion import SLIDING, MotionPlan
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import Workcell
@@ -60,6 +60,20 @@ def test_overhang_is_the_way_out_of_the_rectangle() -> None:
     points = draw.uniform((-0.5, -0.6, 0), (1.4, 0.6, 1), (200, 3))
     for point, found in zip(points, overhang(points, TABLE), strict=True):
         assert found == pytest.approx(max(-0.15 - point[0], point[0] - 1.05, -0.3 - point[1], point[1] - 0.3))
+
+
+@pytest.mark.parametrize("number", [600, 2000])
+@pytest.mark.parametrize(
+    ("shape", "width"), [("disc", 0.12), ("square", 0.09), ("strip", 0.03), ("hammer", 0.0375), ("ring", 0.015)])
+def test_the_width_is_that_of_the_largest_circle_within(shape: str, width: float, number: int) -> None:
+    """Head and handle of the hammer are 3 cm wide; a circle between the face and the two inner corners is a little wider."""
+    x, y = np.random.default_rng(0).uniform(-0.15, 0.15, (2, 200_000))
+    away = np.hypot(x, y)
+    within = {"disc": away < 0.06, "square": np.maximum(abs(x), abs(y)) < 0.045, "strip": (abs(x) < 0.1) & (abs(y) < 0.015),
+              "hammer": (abs(x) < 0.12) & (abs(y) < 0.015) | (abs(x - 0.12) < 0.015) & (abs(y) < 0.05),
+              "ring": (away < 0.05) & (away > 0.035)}[shape]
+    points = np.column_stack([x[within], y[within], 0 * x[within]])[:number] + 0.4
+    assert width_of(points) == pytest.approx(width, rel=0.15, abs=0.004)
 
 
 def test_a_card_is_seen_to_a_millimetre() -> None:

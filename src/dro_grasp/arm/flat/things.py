@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_closing, distance_transform_edt
 from scipy.spatial import ConvexHull, KDTree
 
 from dro_grasp.arm.robots.robot import Table
@@ -34,6 +35,7 @@ HIGHEST = 0.4  # Height up to which it does [m] (ours)
 ASIDE = 0.01  # Distance from the thing from which on it does [m] (ours)
 STRIP = 0.015  # Length of the parts that a thing is cut into, where its outline is not convex [m] (ours)
 MOST_STRIPS = 16  # Most of them (ours)
+FINEST = 0.004  # Edge of the cells of an outline, at least [m] (ours)
 FILLED = 0.9  # Share of its hull that strips fill, from which on a thing counts as convex [1] (ours)
 
 
@@ -43,9 +45,13 @@ def height_of(points: Float[np.ndarray, "n 3"], table: float) -> float:
 
 
 def width_of(points: Float[np.ndarray, "n 3"]) -> float:
-    """Extent of points across their longest, as seen from above [m]."""
-    spread = points[:, :2] - points[:, :2].mean(0)
-    return float(np.ptp(spread @ np.linalg.svd(spread, full_matrices=False)[2][1]))
+    """Diameter of the largest circle within the outline of points, as seen from above [m]: of a hammer, about its handle's."""
+    flat = points[:, :2] - points[:, :2].min(0)
+    cell = max(FINEST, 2 * float(np.median(KDTree(flat).query(flat, 2)[0][:, 1])))
+    places = (flat / cell).astype(int) + 2
+    seen = np.zeros(places.max(0) + 3, bool)
+    seen[tuple(places.T)] = True
+    return float(2 * cell * distance_transform_edt(binary_closing(seen, np.ones((3, 3)))).max() - cell)
 
 
 def lies_flat(points: Float[np.ndarray, "n 3"], table: float) -> bool:
