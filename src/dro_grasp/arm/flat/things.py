@@ -51,7 +51,8 @@ def width_of(points: Float[np.ndarray, "n 3"]) -> float:
     places = (flat / cell).astype(int) + 2
     seen = np.zeros(places.max(0) + 3, bool)
     seen[tuple(places.T)] = True
-    return float(2 * cell * distance_transform_edt(binary_closing(seen, np.ones((3, 3)))).max() - cell)
+    inside = np.asarray(distance_transform_edt(binary_closing(seen, np.ones((3, 3)))))
+    return float(2 * cell * inside.max() - cell)
 
 
 def lies_flat(points: Float[np.ndarray, "n 3"], table: float) -> bool:
