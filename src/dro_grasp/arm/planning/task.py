@@ -23,7 +23,7 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, AdmissionConfig
 from dro_grasp.predict.config import AUTO
-from dro_grasp.predict.constraints import LOW, Constraints
+from dro_grasp.predict.constraints import Constraints, lies_low
 from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.sources.source import Source
 
@@ -145,16 +145,13 @@ class Task:
         return None if self.robot.table is None else self.robot.table.height
 
     @property
-    def top(self) -> float:
-        """Height of the object's highest point [m]."""
-        return float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
-
-    @property
     def touches_table(self) -> bool:
         """Whether fingertips may touch the table: as in `Constraints.touch_table`."""
         if (asked := self.constraints.touch_table) is not None:
             return asked
-        return self.height is not None and self.top - self.height < LOW
+        if self.height is None:
+            return False
+        return lies_low(self.obj, torch.tensor([*self.T[2, :3], self.height - self.T[2, 3]], dtype=torch.float32))
 
     @property
     def distance(self) -> float:
@@ -200,8 +197,9 @@ class Task:
         """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
         if self.config.constraints != Constraints():
             self.config.constraints.require_fit(moved(self.obj, self.T))
-        if self.height is not None and self.top <= self.height:
-            raise PlanError(f"object '{self.obj.name}' ends at z = {self.top:.3f} m, below the table at {self.height:.3f} m; "
+        top = float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
+        if self.height is not None and top <= self.height:
+            raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; "
                             "give the object in the robot's world frame (camera=..., pose=...), or correct `table` in the "
                             "robot file")
         if self.distance > (longest := self.robot.longest_reach):

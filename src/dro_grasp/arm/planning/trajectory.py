@@ -26,6 +26,7 @@ USED = 0.95
 CARRY_SPEED = 0.5  # Share of the arm's velocities with which it carries an object [1] (ours): it is held by friction alone
 CARRY_ACCELERATION = 0.25  # The same of its accelerations [1] (ours)
 LOWER_SECONDS = 1.5  # Least time in which an object is lowered [s] (ours)
+CLOSING_CHECKS = 9  # Postures between pregrasp and grasp in which the hand has to keep clear of the table (ours)
 RELEASE_SECONDS = 1.5  # Least time in which the hand lets go [s] (ours)
 RETREAT_SECONDS = 1.0  # Least time in which it leaves the object [s] (ours)
 Pair = tuple[Trajectory, Trajectory]  # Of arm and hand, at the same times
@@ -137,10 +138,11 @@ def _lifting(
     # A spline through these would swing beyond them, and out of the joints' range.
     close = joined([cornered(hand.closing, *fingers, closing_seconds), standing(hand.squeeze, grip_seconds)])
     approach, lift = smooth(goal.approach, *limits, STEP), smooth(goal.lift, *limits, STEP)
-    start = robot.T_world_wrist(grasp)
+    start, to_grasp = robot.T_world_wrist(grasp), np.linspace(hand.pregrasp, hand.grasp, CLOSING_CHECKS)
     free = clear(reach) and all(
         cell.free(standoff, posture, 0.0) for posture in shape.position) and all(
         cell.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
+        cell.free(grasp, posture, 0.0, touch=True) for posture in to_grasp) and all(
         cell.free(grasp, posture, 0.0, touch=True, aimed=True) for posture in close.position) and all(
         cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True, aimed=True) for q in lift.position)
     if not free:
