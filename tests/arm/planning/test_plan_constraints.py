@@ -166,7 +166,7 @@ def test_every_batch_is_asked_for_with_the_least_confidence(
     config = dro.PlanConfig(num=2, batches=2, directions=directions, least_confidence=least)
     with pytest.raises(dro.DroGraspError, match="nothing is made"):
         plan(robot, *standing, predictor=listener, config=config)
-    assert listener.asked == [least] * each + [config.doubtful if least is None else least] * each
+    assert listener.asked == [config.doubtful if least is None else least] * each + [least or 0.0] * each
 
 
 def test_grasps_below_the_least_confidence_are_not_tried(

@@ -24,6 +24,7 @@ import dro_grasp.arm.robots.robot as dro_robot
 from dro_grasp.arm.planning.motion import STAGES, MotionPlan
 from dro_grasp.arm.planning.physics import Deviation
 from dro_grasp.arm.planning.planner import ALIKE, ALIKE_TURN, failed_before, plan
+from dro_grasp.arm.planning.reachability import Fault
 from dro_grasp.arm.planning.task import PlanConfig, Task
 from dro_grasp.arm.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
@@ -88,11 +89,11 @@ def test_a_plan_has_the_forces_of_its_grasp(robot: dro.Robot, standing: tuple[dr
     assert made.notes.squeeze_force == 6.25
 
 
-@pytest.mark.parametrize(("weight", "asked"), [(1.0, 1), (100.0, 3)])
+@pytest.mark.parametrize(("weight", "score", "asked"), [(1.0, -1.9, 1), (100.0, -1.9, 3), (1.0, -2.1, 3)])
 def test_what_holds_in_all_rehearsals_is_taken_at_once_though_its_score_is_low(
-    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], weight: float, asked: int
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], weight: float, score: float, asked: int
 ) -> None:
-    """What lets go in one of two is taken only once a batch has no more grasps."""
+    """What lets go in one of two, or is doubtful, is taken only once a batch has no more grasps."""
     shown = []
 
     class Doubting(dro.GraspPredictor):
@@ -100,12 +101,31 @@ def test_what_holds_in_all_rehearsals_is_taken_at_once_though_its_score_is_low(
             made = next(iter(super().rounds(*arguments)))
             for _ in range(3):
                 shown.append(len(made))
-                yield made.replace(score=torch.full((len(made),), -3.0))
+                yield made.replace(score=torch.full((len(made),), score))
 
     made = plan(robot, *standing, predictor=Doubting(), seed=0, config=PlanConfig(
         num=12, deviations=(Deviation(), Deviation(weight=weight))))
     assert len(shown) == asked
-    assert made.notes.score == -3
+    assert made.notes.score == pytest.approx(score)
+    assert made.notes.rehearsed == 1 / len({1.0, weight})
+
+
+@pytest.mark.parametrize(("score", "tried"), [(-1.9, True), (-2.1, False)])
+def test_what_loses_the_object_in_its_rehearsal_is_tried_last_unless_it_is_hopeless_anyway(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], score: float, tried: bool
+) -> None:
+    """Here the object is far too heavy in the rehearsal. At these scores, 13 and 11 % hold."""
+    class Doubting(dro.GraspPredictor):
+        def rounds(self, *arguments: Any) -> Iterator[dro.GraspBatch]:
+            made = next(iter(super().rounds(*arguments)))
+            yield made.replace(score=torch.full((len(made),), score))
+
+    config = PlanConfig(batches=1, deviations=(Deviation(weight=1000.0),))
+    if tried:
+        assert plan(robot, *standing, predictor=Doubting(), seed=0, config=config).notes.rehearsed == 0
+    else:
+        with pytest.raises(PlanError, match=Fault.LOSES):
+            plan(robot, *standing, predictor=Doubting(), seed=0, config=config)
 
 
 def test_the_check_above_sees_a_plan_that_goes_through_the_wall(

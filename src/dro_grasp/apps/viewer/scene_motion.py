@@ -33,6 +33,7 @@ from dro_grasp.objects.perception.segmentation import STRUCTURE
 from dro_grasp.objects.scenery import THIN, FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.finish import LEAST_CONFIDENCE
 from dro_grasp.predict.predictor import GraspPredictor
 
 PLACE_COLOUR: Colour = (0.30, 0.65, 0.42)  # Green of where the thing will stand
@@ -166,8 +167,9 @@ class RobotScenePage(ScenePage):
             point_shape="circle", precision="float32")
 
     def _offered(self, wish: Wish, found: FoundObject) -> Offer:
-        """Grasps as the planner makes them, those first that the arm can carry out."""
+        """Grasps that are trusted without a rehearsal, those first that the arm can carry out."""
         task = self._task(wish, found, None)
+        task = replace(task, config=replace(task.config, least_confidence=LEAST_CONFIDENCE))
         task.check_start()
         grasps = GraspBatch.concatenate([*predicted(task, self.predictor)(0)]).sorted_by_score()
         self._still(wish)

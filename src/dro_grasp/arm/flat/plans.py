@@ -132,7 +132,8 @@ def _trusted(
         PlanError: There is none.
     """
     wanted = place if place is None or isinstance(place, Place) else Place.of(place)
-    task, tries = Task.of(robot, obj, np.eye(4), obstacles, replace(config, batches=1), seed, start, wanted), Tries()
+    task = Task.of(robot, obj, np.eye(4), obstacles, replace(config, batches=1), seed, start, wanted)
+    tries = Tries(grasps is None)
     task.check_start()
     made = first_trusted(task, tries, grasps, predictor)
     if made is None:

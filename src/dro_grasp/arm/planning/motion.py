@@ -112,6 +112,8 @@ class PlanNotes:
     T_world_held: list[list[float]] | None = None
     """Where the wrist would have taken hold of an object that does not shift as the hand closes, to have it in the hand as it
     is, by the rehearsal [m]; None in plans without a place."""
+    rehearsed: float | None = None
+    """Share of its rehearsed lifts in which the grasp holds the object; None where nothing was rehearsed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +239,12 @@ class MotionPlan:
             return [f"no grasp of it is trusted: it is pushed by {100 * np.hypot(n.slide[0][3], n.slide[1][3]):.0f} cm to the "
                     "table's edge; then look again, and plan again",
                     f"motion of {self.seconds:.1f} s: {spans}"]
+        sure = "" if n.rehearsed is None else f", held in {100 * n.rehearsed:.0f} % of its rehearsed lifts"
         forces = f"; it {told}" if (told := forces_in_words(n.payload, n.squeeze_force)) else ""
         put = [] if n.place is None else [_place_in_words(np.array(n.place), self.scene.points)]
         return [
             grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
-            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'{forces}",
+            f"grasp {n.chosen}, score {n.score:.2f}{sure}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'{forces}",
             *put,
             f"motion of {self.seconds:.1f} s: {spans}",
             "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),

@@ -80,7 +80,7 @@ def plan(
     wanted = place if place is None or isinstance(place, Place) else Place.of(place)
     task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted, avoid)
     task.check_start()
-    tries = Tries()
+    tries = Tries(grasps is None)
     made = first_trusted(task, tries, grasps, predictor) or first_possible(task, tries)
     if made is not None:
         return made
@@ -93,6 +93,7 @@ def plan(
 class Tries:
     """What became of the grasps so far, by their number, in the order in which they were made."""
 
+    predicted: bool = True  # By the predictor, and not given
     parts: list[GraspBatch] = field(default_factory=list)
     waiting: list[int] = field(default_factory=list)  # Not tried yet, in the order of trying
     ready: list[Feasible] = field(default_factory=list)
@@ -122,6 +123,10 @@ class Tries:
         """What is left over, which it is no longer."""
         taken, self.ready = self.ready, []
         return taken
+
+    def likely(self, task: Task) -> list[bool]:
+        """Which of all grasps are not doubtful; scores of others' grasps may mean anything."""
+        return (self.grasps.confidence >= task.config.doubtful).tolist() if self.predicted else [True] * self.made
 
     @property
     def made(self) -> int:
@@ -249,9 +254,9 @@ def rehearsed(task: Task, tries: Tries, found: Iterator[Feasible]) -> list[Feasi
 
 
 def best_lost(task: Task, tries: Tries) -> list[Feasible]:
-    """The best of those that lose the object when rehearsed: the object may be other than it is thought to be."""
-    score = tries.grasps.score.tolist()
-    tries.lost.sort(key=lambda goal: -score[goal.index])
+    """The best of those that lose the object when rehearsed, but are no hopeless ones, taken from what is left."""
+    score, likely = tries.grasps.score.tolist(), tries.likely(task)
+    tries.lost = sorted((goal for goal in tries.lost if likely[goal.index]), key=lambda goal: -score[goal.index])
     goals, tries.lost = tries.lost[:task.config.top], tries.lost[task.config.top:]
     for goal in goals:
         del tries.dropped[goal.index]
@@ -260,12 +265,12 @@ def best_lost(task: Task, tries: Tries) -> list[Feasible]:
 
 def trusted(task: Task, tries: Tries, whole: bool) -> list[Feasible]:
     """Goals for whose sake no further grasps are needed, within a batch or after the whole of it, taken from what is left."""
-    config, score = task.config, tries.grasps.score.tolist()
+    config, score, likely = task.config, tries.grasps.score.tolist(), tries.likely(task)
 
     def enough(number: int) -> bool:
         if task.rehearsal is None:
             return config.order == "random" or score[number] >= config.trusted_score
-        return tries.share[number] >= (config.trusted_share if whole else 1.0)
+        return tries.share[number] >= config.trusted_share if whole else tries.share[number] == 1 and likely[number]
 
     ready = tries.taken()
     tries.ready = [goal for goal in ready if not enough(goal.index)]
@@ -336,7 +341,7 @@ def _described(
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
         scales=None if robot.drivers.are_usual else robot.drivers.scales,
         hold={name: tuple(expected.extra[name][0].double().reshape(-1).tolist()) for name in (*HOLD_COLUMNS, WEIGHT_COLUMN)},
-        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist())
+        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist(), rehearsed=tries.share.get(chosen))
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

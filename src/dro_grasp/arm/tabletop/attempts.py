@@ -40,6 +40,8 @@ class Attempt:
     """How much higher the object was at the end than at rest [m]."""
     score: float = float("nan")
     """Score of the grasp [log-odds of holding]."""
+    rehearsed: float | None = None
+    """Share of its rehearsed lifts in which the grasp held the object; None where nothing was rehearsed."""
     grasps: int = 0
     """Grasps to choose from."""
     dropped: str = "{}"

@@ -38,7 +38,7 @@ from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 
-LABEL = "tabletop/9 "
+LABEL = "tabletop/10 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 16  # Most pushes of a flat thing towards an edge (ours)
@@ -188,8 +188,8 @@ def attempt(
     notes = made.notes
     result = replace(
         result, processor_seconds=time.process_time() - processor, plan_seconds=time.perf_counter() - begin,
-        grasp_seconds=notes.seconds["grasps"], score=notes.score, grasps=notes.grasps, dropped=json.dumps(notes.dropped),
-        motion_seconds=made.seconds)
+        grasp_seconds=notes.seconds["grasps"], score=notes.score, rehearsed=notes.rehearsed, grasps=notes.grasps,
+        dropped=json.dumps(notes.dropped), motion_seconds=made.seconds)
     if watch is not None:
         watch.planned(seen, made)
     stage, reason = carry_out(scene, made, config, watch)
