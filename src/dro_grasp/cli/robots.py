@@ -85,8 +85,8 @@ class Plan:
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.12, or 0.2 with --rehearsals 0")] = None
-    """Grasps that hold with less probability are not tried; 0 tries all. By default, the last of several batches tries all that
-    hold the object when rehearsed."""
+    """Grasps that hold with less probability are not tried; 0 tries all. By default, the last of three batches also tries
+    those that hold the object when rehearsed."""
     planner_seconds: float = 3.0  # Longest time for one path [s].
     seed: int = 0  # Seed of grasps, inverse kinematics and planner.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None

@@ -110,17 +110,17 @@ def test_what_holds_in_all_rehearsals_is_taken_at_once_though_its_score_is_low(
     assert made.notes.rehearsed == 1 / len({1.0, weight})
 
 
-@pytest.mark.parametrize(("score", "tried"), [(-1.9, True), (-2.1, False)])
+@pytest.mark.parametrize(("score", "least", "tried"), [(-1.9, None, True), (-2.1, None, False), (-2.1, 0.0, True)])
 def test_what_loses_the_object_in_its_rehearsal_is_tried_last_unless_it_is_hopeless_anyway(
-    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], score: float, tried: bool
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], score: float, least: float | None, tried: bool
 ) -> None:
-    """Here the object is far too heavy in the rehearsal. At these scores, 13 and 11 % hold."""
+    """Here the object is far too heavy in the rehearsal. At these scores, 13 and 11 % hold; who asks for all gets all."""
     class Doubting(dro.GraspPredictor):
         def rounds(self, *arguments: Any) -> Iterator[dro.GraspBatch]:
             made = next(iter(super().rounds(*arguments)))
             yield made.replace(score=torch.full((len(made),), score))
 
-    config = PlanConfig(batches=1, deviations=(Deviation(weight=1000.0),))
+    config = PlanConfig(batches=1, deviations=(Deviation(weight=1000.0),), least_confidence=least)
     if tried:
         assert plan(robot, *standing, predictor=Doubting(), seed=0, config=config).notes.rehearsed == 0
     else:

@@ -126,7 +126,9 @@ class Tries:
 
     def likely(self, task: Task) -> list[bool]:
         """Which of all grasps are not doubtful; scores of others' grasps may mean anything."""
-        return (self.grasps.confidence >= task.config.doubtful).tolist() if self.predicted else [True] * self.made
+        config = task.config
+        least = config.doubtful if config.least_confidence is None else config.least_confidence
+        return (self.grasps.confidence >= least).tolist() if self.predicted else [True] * self.made
 
     @property
     def made(self) -> int:
