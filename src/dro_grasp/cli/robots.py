@@ -84,7 +84,7 @@ class Plan:
     """Friction between hand, object and table, in simulated lifts."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
-    least_confidence: Annotated[float | None, optional("P", "0.12, or 0.2 with --rehearsals 0")] = None
+    least_confidence: Annotated[float | None, optional("P", "0.2 with --rehearsals 0, else 0.12")] = None
     """Grasps that hold with less probability are not tried; 0 tries all. By default, the last of three batches also tries
     those that hold the object when rehearsed."""
     planner_seconds: float = 3.0  # Longest time for one path [s].
