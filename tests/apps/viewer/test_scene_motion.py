@@ -21,6 +21,7 @@ from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
 from dro_grasp.arm.planning.motion import ALL_STAGES, CHOSEN, MotionPlan, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.planning.placing import height_below
 from dro_grasp.arm.planning.reachability import Fault
+from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import Scene
@@ -76,11 +77,19 @@ def asked() -> list[dict[str, Any]]:
 
 
 @pytest.fixture
+def confident() -> list[float]:
+    """The least confidence of the grasps that were asked for, each time."""
+    return []
+
+
+@pytest.fixture
 def page(
-    scene: Scene, robot: dro.Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: list[dict[str, Any]]
+    scene: Scene, robot: dro.Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: list[dict[str, Any]],
+    confident: list[float],
 ) -> Iterator[RobotScenePage]:
     """Three grasps of anything, of which the arm can carry out the second and third."""
     def predicted(task: Any, predictor: Any) -> Any:
+        confident.append(task.least_confidence(0))
         T = torch.eye(4).repeat(3, 1, 1)
         T[:, :3, 3] = torch.from_numpy(task.obj.cloud.mean(0)) + torch.tensor([[0.0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.1]])
         joints = robot.hand.canonical_joints(0.5).expand(3, -1)
@@ -113,6 +122,16 @@ def thing_at(page: RobotScenePage, x: float, y: float) -> int:
 
 
 DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def test_what_is_offered_without_a_rehearsal_is_as_confident_as_what_generate_returns(
+    page: RobotScenePage, confident: list[float]
+) -> None:
+    """The planner itself asks for less, as it rehearses."""
+    page.click(np.array([0.45, 0.0, 1.0]), DOWN)
+    assert page.offer is not None, page.status.content
+    assert confident == [scene_motion.LEAST_CONFIDENCE]
+    assert PlanConfig().doubtful < scene_motion.LEAST_CONFIDENCE
 
 
 def test_a_thing_its_place_and_its_motion_are_clicked_and_played(

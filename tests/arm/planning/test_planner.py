@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 import dro_grasp.arm.robots.robot as dro_robot
+from dro_grasp.arm.planning.candidates import grasps_in_world
 from dro_grasp.arm.planning.motion import STAGES, MotionPlan
 from dro_grasp.arm.planning.physics import Deviation
 from dro_grasp.arm.planning.planner import ALIKE, ALIKE_TURN, failed_before, plan
@@ -31,6 +32,8 @@ from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.extras import EXTRAS
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
 
@@ -126,6 +129,25 @@ def test_what_loses_the_object_in_its_rehearsal_is_tried_last_unless_it_is_hopel
     else:
         with pytest.raises(PlanError, match=Fault.LOSES):
             plan(robot, *standing, predictor=Doubting(), seed=0, config=config)
+
+
+def test_given_grasps_are_not_doubtful_whatever_they_score(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    """Another method's scores may mean anything: one batch is enough, and what loses the object is carried out all the same."""
+    wanted, seeds = Constraints(table=robot.table.height), []
+    found = grasps_in_world(dro.GraspPredictor(), robot.hand, *standing, GraspRequest(8, 0), wanted)
+
+    def given(seed: int) -> dro.GraspBatch:
+        seeds.append(seed)
+        return found.replace(score=torch.full((len(found),), -9.0))
+
+    def share(weight: float, batches: int) -> float | None:
+        config = PlanConfig(deviations=(Deviation(weight=weight),), batches=batches)
+        return plan(robot, *standing, grasps=given, config=config).notes.rehearsed
+
+    assert (share(1.0, 3), len(seeds)) == (1, 1)
+    assert share(1000.0, 1) == 0
 
 
 def test_the_check_above_sees_a_plan_that_goes_through_the_wall(
