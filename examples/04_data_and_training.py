@@ -10,7 +10,7 @@ def main(folder: Path) -> None:
     """Make data and weights in a folder, then grasp with them."""
     dro.synthesize_dataset(["gripper3"], ["can", "sphere"], 20, folder / "data", workers=2)
     for pair in dro.read_collection(folder / "data"):
-        print(f"{len(pair.grasps)} grasps of {pair.object} by {pair.hand} hold under protocol 'strict'")
+        print(f"{len(pair.grasps)} grasps of {pair.object} by {pair.hand} hold under protocol 'carry'")
     bundle, _ = dro.make_bundle([folder / "data"], folder / "bundle.safetensors")
 
     network, schedule = dro.NetworkConfig.preset("slim"), dro.ScheduleConfig(steps=3)

@@ -166,7 +166,7 @@ MEASUREMENTS = {
         hand: f"python -m lab.benchmarks.hold_check --generated --hands {hand} --group {OBJECTS['test']} --objects 10 "
         "--grasps 6 --most 34 --json" for hand in ROBOT_HANDS}),
     "planning": Measurement("Times from the image of a scene to a plan, nothing beside", {
-        robot: _lifts(robot, "asked", OBJECTS["test"], 1, "--seed 1 ") for robot in ROBOTS
+        robot: _lifts(robot, "asked", OBJECTS["test"], 2, "--seed 1 ") for robot in ROBOTS
     }, wings=("arm", "compare"), alone=True),
     "constraints": Measurement("What constraints cost, and whether what is returned respects them", {
         name: "python -m lab.benchmarks.constraints --cases " + shlex.quote(name) + " --json"

@@ -19,7 +19,7 @@ from dro_grasp.compare.rows import average
 from lab import pages, targets
 from lab.benchmarks.report import ROOT
 from lab.figure import CONTROLS, FIGURE, METHODS, draw_figure, figure_data
-from lab.measurements import PAPER_HANDS, ROBOTS, SEEN_IN_PART
+from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART
 from lab.reading import HEAD, MissingResult, Results, as_row, line, of, plain, select, state_of, table
 from lab.robot_tables import any_grasp, lifted, planning, robot_tasks
 from lab.runner import RESULTS
@@ -140,27 +140,18 @@ def flat(results: Results) -> str:
     return table(columns, lines)
 
 
-def confidence(results: Results) -> str:
-    """Predicted beside observed, in ten bins: of hands that no weights were trained on, and of objects seen in part."""
-    cells = results.cells("confidence")
-    unseen = [cell for name, cell in cells.items() if not name.startswith(tuple(map(plain, PAPER_HANDS)))]
-    in_part = [cell for name, cell in cells.items() if name.endswith(SEEN_IN_PART)]
-    lines = []
+def confidence(results: Results, in_part: bool) -> str:
+    """Predicted beside observed, in ten bins: of hands that no weights were trained on, or of objects seen in part."""
+    known = tuple(map(plain, PAPER_HANDS))
+    names = [name for name in MEASUREMENTS["confidence"].cells
+             if (name.endswith(SEEN_IN_PART) if in_part else not name.startswith(known))]
+    bins, lines = [b for name in names for b in results.cell("confidence", name)["bins"]], []
     for k in range(10):
-        both = [_reliability(group, k) for group in (unseen, in_part)]
-        if any(map(any, both)):
-            lines.append([f"{10 * k} to {10 * k + 10}", *both[0], *both[1]])
-    of_part = ("seen in part", "predicted [%]", "held [%]")
-    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]", *of_part], lines)
-
-
-def _reliability(cells: Sequence[Any], k: int) -> tuple[Any, str, str]:
-    """Grasps of a bin, what was predicted of them, and how many held; empty words for none."""
-    own = [b for cell in cells for b in cell["bins"] if round(10 * b["from"]) == k]
-    if not (n := sum(b["n"] for b in own)):
-        return "", "", ""
-    predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
-    return n, f"{100 * predicted / n:.0f}", of(round(held), n)
+        own = [b for b in bins if round(10 * b["from"]) == k]
+        if n := sum(b["n"] for b in own):
+            predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
+            lines.append([f"{10 * k} to {10 * k + 10}", n, f"{100 * predicted / n:.0f}", of(round(held), n)])
+    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]"], lines)
 
 
 def methods(results: Results) -> str:
@@ -310,7 +301,8 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "constraints.cost": constraints,
     "tables.sides": sides,
     "flat.things": flat,
-    "confidence.bins": confidence,
+    "confidence.bins": functools.partial(confidence, in_part=False),
+    "confidence.in-part": functools.partial(confidence, in_part=True),
     "methods.others": methods,
     "fidelity.form": fidelity,
     "fidelity.simulation": simulation,

@@ -4,7 +4,7 @@
 #
 #   BUNDLE      training bundle (dro-grasp dataset bundle ... --split train)
 #   VALIDATION  bundle of the validate split, on which distance errors are reported
-#   OUT         existing folder for the results: weights in pieces of 15 MB, checksum, logs
+#   OUT         folder for the results: weights in pieces of 15 MB, checksum, logs
 #   RUNS        folder for checkpoints, which stay on the machine                 (runs)
 #   WHEELS      folder of wheels to install first, listed in docs/training.md    (none)
 #   PROCESSES   training processes, one for each GPU                              (1)
@@ -16,7 +16,7 @@ set -euo pipefail
 RUNS=${RUNS:-runs} PROCESSES=${PROCESSES:-1} NAME=${NAME:-multi}
 PRETRAIN=${PRETRAIN:---minutes 3} TRAIN=${TRAIN:---minutes 6}
 export PYTHONPATH="$(cd "$(dirname "$0")/.." && pwd)/src${PYTHONPATH:+:$PYTHONPATH}"
-mkdir -p "$RUNS"
+mkdir -p "$RUNS" "$OUT"
 
 if [ -n "${WHEELS:-}" ]; then
     python3 -m pip install --quiet --no-index --no-deps --target "$RUNS/packages" "$WHEELS"/*.whl
