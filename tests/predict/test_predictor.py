@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Never
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -161,6 +162,23 @@ def test_a_direction_must_point_somewhere(
 ) -> None:
     with pytest.raises(OptionError, match="has no direction"):
         predictor.predict(HAND, ball, num=1, direction=direction)
+
+
+@pytest.mark.parametrize("make", [np.array, torch.tensor, list])
+def test_constraints_are_given_as_any_kind_of_rows(
+    predictor: GraspPredictor, ball: ObjectModel, make: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def listen(self: GraspPredictor, problem: GraspProblem, *arguments: object) -> Never:
+        asked.append(problem.constraints)
+        raise NoGraspError("nothing is made")
+
+    monkeypatch.setattr(GraspPredictor, "run", listen)
+    with pytest.raises(NoGraspError):
+        predictor.predict(
+            HAND, ball, 1, direction=make([0.0, 0.0, -1.0]), contact_region=make([[0.0, 0.0, 0.0, 0.5]]))
+    assert asked == [Constraints((0.0, 0.0, -1.0), contact_region=((0.0, 0.0, 0.0, 0.5),))]
 
 
 def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:

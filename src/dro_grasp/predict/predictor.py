@@ -147,7 +147,8 @@ class GraspPredictor:
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
                  "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance,
                  "touch_table": touch_table, "margin": margin, "max_force": max_force}
-        wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None and x != ()})
+        asked = {name: x for name, x in given.items() if x is not None and not (isinstance(x, tuple) and x == ())}
+        wanted = replace(constraints or Constraints(), **asked)
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:
             warnings.warn(warning, stacklevel=2)

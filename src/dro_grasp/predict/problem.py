@@ -39,6 +39,8 @@ class GraspProblem:
     """Where the network, the grasp energy and, on CUDA, the simulations of settling run."""
     constraints: Constraints = field(default_factory=Constraints)
     """What grasps have to respect."""
+    fixed: tuple[str, ...] = ()
+    """Names of those that describe a place as it is, which nobody can relax: no advice names them."""
     _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)
     _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 

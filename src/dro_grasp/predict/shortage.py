@@ -103,7 +103,8 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
         "keep_out": "make the balls of keep_out smaller",
         "pregrasp_clearance": f"ask for less pregrasp_clearance (now {_short(constraints.pregrasp_clearance)} m)",
     }
-    given = [words for name, words in steps.items() if getattr(constraints, name) not in (None, ())]
+    asked = [name for name in steps if getattr(constraints, name) not in (None, ()) and name not in problem.fixed]
+    given = [steps[name] for name in asked]
     if constraints.table is None and dropped.get(PLANE):
         given.append("state the table's height if it is lower than the one found in the cloud")
     return given

@@ -87,6 +87,15 @@ def test_played_lifts_say_what_the_joints_say_of_the_hand(robot: dro.Robot, plan
     assert Film.of_plan(robot, plan).held == ()
 
 
+def test_a_plan_plays_the_same_however_drivers_count(robot: dro.Robot, plan: dro.MotionPlan) -> None:
+    draw = np.random.default_rng(0)
+    n = len(plan.notes.arm_joints) + len(plan.notes.hand_joints)
+    notes = replace(plan.notes, zeros=tuple(draw.uniform(-1, 1, n)), scales=tuple(draw.choice([-1.0, 57.3], n)))
+    usual, other = Film.of_plan(robot, plan), Film.of_plan(robot, replace(plan, notes=notes))
+    for name in ("arm", "hand", "poses"):
+        np.testing.assert_allclose(getattr(other, name), getattr(usual, name), atol=1e-6)
+
+
 def test_each_attempt_is_played_with_its_own_robot_and_weights(
     robot: dro.Robot, small_robot: str, tmp_path: Path
 ) -> None:

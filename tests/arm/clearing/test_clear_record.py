@@ -93,6 +93,11 @@ def test_a_rig_of_ones_own_is_recorded(robot: dro.Robot) -> None:
     rig.move(arm, Trajectory(time, still, 0 * still, 0 * still))
     assert own.moved == 1
     assert rig.joints()[0] is robot.home
+    watched = Trajectory(np.array([0.0, 0.01]), way[-2:], 0 * way[:2], 0 * way[:2])
+    for _ in range(20):  # as the joints are watched
+        rig.move(watched, Trajectory(watched.time, still[:2], 0 * still[:2], 0 * still[:2]))
+    assert len(recorder.frames) == 12
+    del recorder.frames[10:]
     recorder.picked(replace(Pick((0.5, 0.1), "lift"), reason="the hand is empty, by its joints"))
     record = recorder.record(robot)
     assert record.poses.shape == (10, 0, 4, 4)

@@ -12,6 +12,7 @@ import pytest
 import dro_grasp as dro
 from dro_grasp.arm.clearing import loop
 from dro_grasp.arm.clearing.loop import Bin, ClearConfig, Pick, clear_table
+from dro_grasp.arm.clearing.trial import clear_trial
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.planning.placing import Place
 from dro_grasp.errors import OptionError, PlanError
@@ -235,3 +236,10 @@ def test_a_bin_holds_what_is_above_it_and_has_four_walls() -> None:
 def test_what_is_no_bin_and_no_number_is_refused(wrong: Any, told: str) -> None:
     with pytest.raises(OptionError, match=told):
         wrong()
+
+
+@pytest.mark.parametrize("lacking", ["table", "camera"])
+def test_a_table_and_a_camera_are_needed(robot: dro.Robot, lacking: str) -> None:
+    can = dro.load_object("can")
+    with pytest.raises(OptionError, match=f"has no {lacking}; state it in the robot file"):
+        clear_trial(replace(robot, **{lacking: None}), [can], 0, 0, dro.GraspPredictor())

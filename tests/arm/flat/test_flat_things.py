@@ -13,12 +13,13 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.apps.viewer.lift_page import Film
+from dro_grasp.arm.flat import plans, sliding
 from dro_grasp.arm.flat.grips import flat_grasps, overhangs
 from dro_grasp.arm.flat.plans import plan_or_slide
 from dro_grasp.arm.flat.postures import AHEAD, OVER, WorkingHand, flat_grips
-from dro_grasp.arm.flat.sliding import SlideConfig, pushes, slide
+from dro_grasp.arm.flat.sliding import SlideConfig, _Pusher, pushes, slide
 from dro_grasp.arm.flat.things import flat_object, overhang, seen_flat, width_of
-from dro_grasp.arm.planning.motion import SLIDING, MotionPlan
+from dro_grasp.arm.planning.motion import SLIDING, MotionPlan, Trajectory
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
@@ -279,6 +280,8 @@ def test_nothing_is_pushed_through_other_things(narrow: Robot) -> None:
     walls = [board((0.6, 0.02, 0.1), (0.45, y)) for y in (-0.18, 0.25)]
     with pytest.raises(PlanError, match="the arm reaches no edge of the table"):
         slide(narrow, thing, walls)
+    with pytest.raises(PlanError, match=r"reaches no edge .*, and things stand in the way of \d+ pushes; move them"):
+        slide(replace(narrow, camera=None), thing, [*walls, board((0.02, 0.4, 0.1), (0.7, 0.0))])
     with pytest.raises(PlanError, match="has no table; state its centre and size"):
         slide(replace(narrow, table=None), thing)
 
@@ -339,3 +342,75 @@ def test_an_attempt_pushes_looks_again_and_lifts(narrow: Robot) -> None:
     done = attempt(narrow, coaster, 0, 0, dro.GraspPredictor(), config)
     assert done.pushes >= 1
     assert done.success, done.reason
+
+
+def test_pushes_mind_what_the_constraints_say(narrow: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    thing, wall = board((0.11, 0.09, 0.005), (0.4, -0.1)), board((0.6, 0.02, 0.1), (0.45, -0.18))
+    in_way = list[int]()
+
+    def counted(
+        robot: Robot, obj: dro.ObjectModel, obstacles: list[dro.ObjectModel], *others: object, **given: object
+    ) -> MotionPlan:
+        points = np.concatenate([np.zeros((0, 3)), *(o.cloud for o in obstacles)])
+        in_way.append(int((np.abs(points[:, 1] + 0.18) < 0.02).sum()))
+        raise PlanError("not pushed")
+
+    def nothing(*arguments: object, **given: object) -> MotionPlan:
+        raise PlanError("no grasp")
+
+    monkeypatch.setattr(plans, "slide", counted)
+    monkeypatch.setattr(plans, "plan", nothing)
+    scene = dro.load_scene(trimesh.Trimesh(wall.vertices, wall.faces))
+    for constraints in (dro.Constraints(), dro.Constraints(obstacles=scene)):
+        with pytest.raises(PlanError, match="not pushed"):
+            plan_or_slide(narrow, thing, config=dro.PlanConfig(constraints=constraints))
+    assert in_way[0] == 0
+    assert max(in_way) > 100
+    ball = ((0.4, -0.1, 0.0, 0.05),)
+    for constraints in (dro.Constraints(keep_out=ball), dro.Constraints(contact_region=ball)):
+        with pytest.raises(PlanError, match="is not pushed: fingers would touch it anywhere"):
+            plan_or_slide(narrow, thing, config=dro.PlanConfig(constraints=constraints))
+
+
+def test_a_line_that_cannot_be_pressed_is_tried_from_another_start_as_it_was(
+    narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPlan]
+) -> None:
+    thing, _ = pushed
+    pusher, heights = _Pusher(narrow, thing, (), SlideConfig(seeds=3), 0, narrow.home), list[float]()
+
+    class Solver:
+        def solve(self, T: np.ndarray, seeds: object) -> np.ndarray:
+            return narrow.home
+
+        def follow(self, poses: np.ndarray, start: np.ndarray) -> np.ndarray | None:
+            heights.append(float(poses[0, 2, 3]))
+            return None if len(heights) % 4 == 0 else np.tile(narrow.home, (len(poses), 1))
+
+    pusher.solver = Solver()  # type: ignore[assignment]
+    T = np.eye(4)
+    T[2, 3] = 0.3
+    assert pusher._solved(T, np.array([0.1, 0.0, 0.0])) is None
+    assert heights[0::4] == [0.3] * 3
+    assert heights[3::4] == pytest.approx([0.3 - SlideConfig().hover - SlideConfig().press] * 3)
+
+
+def test_an_arm_stops_at_corners_where_a_smooth_way_comes_too_near(
+    narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPlan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thing, _ = pushed
+    pusher, end = _Pusher(narrow, thing, (), SlideConfig(), 0, narrow.home), narrow.home + 0.2
+
+    def free(q: np.ndarray, clearance: float) -> bool:
+        return bool(q[0] <= end[0] + 1e-9)
+
+    def swinging(waypoints: np.ndarray, *limits: object) -> Trajectory:
+        beyond = np.stack([waypoints[0], waypoints[-1] + 0.1, waypoints[-1]])
+        return Trajectory(np.arange(3.0), beyond, 0 * beyond, 0 * beyond)
+
+    assert len(pusher._way(narrow.home, end, free, 0.0).time) > 3  # type: ignore[union-attr]
+    monkeypatch.setattr(sliding, "smooth", swinging)
+    made = pusher._way(narrow.home, end, free, 0.0)
+    assert made is not None
+    assert len(made.time) > 3
+    monkeypatch.setattr(sliding, "cornered", swinging)
+    assert pusher._way(narrow.home, end, free, 0.0) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from dro_grasp.predict.admission import AdmissionConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
-from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
@@ -62,7 +64,23 @@ def test_where_nothing_is_found_it_says_why(tmp_path: Path) -> None:
             trusted_in_surroundings=()))
     asked = GraspPredictor(str(untrained_weights(tmp_path)), config=nowhere)
     for directions in ("all", torch.eye(3)[:2]):
-        with pytest.raises(NoGraspError, match=r"only 0 of \d+ candidates on object 'can' .* lower table"):
+        with pytest.raises(NoGraspError, match=r"only 0 of \d+ candidates on object 'can' ") as told:
             grasps_in_world(asked, HAND, CAN, T, GraspRequest(2, 1, 1), Constraints(table=0.0), directions)
+        assert "lower table" not in str(told.value), "the table is the robot's"
     with pytest.raises(OptionError, match="leaves nothing of the object"):
         grasps_in_world(asked, HAND, CAN, T, GraspRequest(2, 1, 1), Constraints(table=2.0))
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_each_request_has_its_direction(num: int) -> None:
+    asked = []
+
+    class Listener(GraspPredictor):
+        def run(self, problem: GraspProblem, *arguments: Any) -> Prediction:
+            asked.append(problem.constraints.direction)
+            raise NoGraspError("nothing is made")
+
+    with pytest.raises(NoGraspError):
+        grasps_in_world(Listener(), HAND, CAN, T, GraspRequest(num), Constraints(), "paper")
+    assert len(asked) == num
+    assert all(direction is not None for direction in asked)

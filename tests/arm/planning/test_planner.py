@@ -24,16 +24,19 @@ import dro_grasp.arm.robots.robot as dro_robot
 from dro_grasp.arm.planning.candidates import grasps_in_world
 from dro_grasp.arm.planning.motion import STAGES, MotionPlan
 from dro_grasp.arm.planning.physics import Deviation
-from dro_grasp.arm.planning.planner import ALIKE, ALIKE_TURN, failed_before, plan
+from dro_grasp.arm.planning.planner import ALIKE, ALIKE_TURN, Tries, add, failed_before, plan
 from dro_grasp.arm.planning.reachability import Fault
-from dro_grasp.arm.planning.task import PlanConfig, Task
+from dro_grasp.arm.planning.task import PlanConfig, Task, table_below
 from dro_grasp.arm.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.errors import NoGraspError, OptionError, PlanError, RobotError
 from dro_grasp.extras import EXTRAS
+from dro_grasp.predict.admission import PLANE
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import complete
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
 
@@ -231,6 +234,44 @@ def test_what_touches_the_robot_at_home_is_named(
     raised = replace(robot, table=replace(robot.table, height=robot.T_world_wrist(robot.home)[2, 3]))
     with pytest.raises(RobotError, match=r"(arm|hand)/\w+ and table, by .* mm; correct `table` in the robot file"):
         plan(raised, can, trimesh.transformations.translation_matrix((0.5, 0.1, 0.6)), [wall])
+
+
+def test_a_maker_of_grasps_that_finds_none_is_asked_again(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    asked = list[int]()
+
+    def none(seed: int) -> dro.GraspBatch:
+        asked.append(seed)
+        raise NoGraspError("none with this seed")
+
+    with pytest.raises(PlanError, match="none with this seed"):
+        plan(robot, *standing, config=PlanConfig(batches=2), grasps=none)
+    assert len(asked) == 2
+
+
+def test_other_constraints_do_not_make_a_table_of_the_plane_in_a_cloud(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], planned: MotionPlan
+) -> None:
+    """Here it is far above the thing; the robot's own table is what counts."""
+    can, T = standing
+    above = replace(can, table=np.array([0.0, 0.0, 1.0, 1.0], np.float32))
+    task = Task.of(robot, above, T, (), PlanConfig(constraints=dro.Constraints(max_force=50.0)), 0)
+    wrists, joints = (torch.from_numpy(a).float() for a in (planned.scene.T_world_wrist, planned.scene.joints))
+    grasps, tries = dro.GraspBatch.create(robot.hand, above, wrists, joints), Tries()
+    add(task, tries, complete(GraspProblem(robot.hand, can), grasps))
+    assert PLANE not in tries.counts
+    assert len(tries.waiting) > 0
+
+
+def test_without_a_table_the_one_that_was_seen_counts(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    can, T = standing
+    low = float((can.cloud @ T[:3, :3].T + T[:3, 3])[:, 2].min())
+    assert table_below(robot, can, T).height == pytest.approx(low)
+    seen = replace(can, table=np.array([0.0, 0.0, 1.0, low - T[2, 3] - 0.03], np.float32))
+    assert table_below(robot, seen, T).height == pytest.approx(low - 0.03, abs=1e-6)
 
 
 def test_each_batch_of_grasps_is_another_one(

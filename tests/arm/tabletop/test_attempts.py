@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,15 +14,18 @@ import torch
 from PIL import Image
 
 import dro_grasp as dro
+from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.planning.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.tabletop import experiment
 from dro_grasp.arm.tabletop.animation import Recorder, draw_animation
+from dro_grasp.arm.tabletop.attempts import Attempt
 from dro_grasp.arm.tabletop.camera_view import STRIDE, depth_image, thinned_intrinsics
-from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
+from dro_grasp.arm.tabletop.experiment import PUSHES, TabletopConfig, attempt
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object
 from dro_grasp.arm.tabletop.table_setup import APART, other_objects, rest, scatter
+from dro_grasp.errors import OptionError
 from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
 from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.perception.scene_files import SceneCamera
@@ -203,3 +207,48 @@ def test_settings_go_through_labels_and_back() -> None:
     assert config.label() != TabletopConfig().label()
     heavier = TabletopConfig(plan=dro.PlanConfig(deviations=(Deviation((0.01, 0.0), 0.5, 2.0),)))
     assert TabletopConfig.from_label(heavier.label()) == heavier
+
+
+def test_settings_that_cannot_be_stored_are_refused() -> None:
+    with pytest.raises(OptionError, match="attempts are stored with their settings, so give a name"):
+        TabletopConfig(plan=dro.PlanConfig(source=dro.GraspPredictor().source("optimiser")))
+    with pytest.raises(OptionError, match="no deviations to rehearse lifts with"):
+        dro.PlanConfig(deviations=())
+
+
+@pytest.mark.parametrize("pushes", [2, 99])
+def test_a_thing_is_judged_from_where_pushes_left_it_and_they_have_an_end(
+    robot: dro.Robot, can: dro.ObjectModel, planned: MotionPlan, monkeypatch: pytest.MonkeyPatch, pushes: int
+) -> None:
+    """What is planned and carried out is made up; each push moves the can by 5 cm."""
+    made, starts = list[MotionPlan](), list[np.ndarray]()
+
+    def plans(*arguments: object, **given: object) -> MotionPlan:
+        pushing = len(made) < pushes
+        made.append(replace(planned, notes=replace(planned.notes, slide=np.eye(4).tolist() if pushing else None)))
+        return made[-1]
+
+    def push(result: Attempt, scene: LiftScene, *others: object) -> Attempt:
+        T = scene.pose(0)
+        T[0, 3] += 0.05
+        scene.place(0, T)
+        return replace(result, pushes=result.pushes + 1)
+
+    def judged(result: Attempt, scene: LiftScene, start: np.ndarray, plan: MotionPlan) -> Attempt:
+        starts.append(start)
+        return replace(result, place_error=0.0, place_tilt=0.0)
+
+    monkeypatch.setattr(experiment, "may_slide", lambda *_: True)
+    monkeypatch.setattr(experiment, "plan_or_slide", plans)
+    monkeypatch.setattr(experiment, "_pushed", push)
+    monkeypatch.setattr(experiment, "carry_out", lambda *_: ("done", ""))
+    monkeypatch.setattr(experiment, "measured", judged)
+    done = attempt(robot, can, 0, 0, dro.GraspPredictor(), TabletopConfig(see="mesh", place=True))
+    if pushes > 2:
+        assert (done.pushes, done.stage) == (PUSHES, "slide")
+        assert f"after {PUSHES} pushes" in done.reason
+        return
+    assert done.success
+    first = np.array(json.loads(done.place))
+    assert starts[0][0, 3] == pytest.approx(first[0, 3] + 0.1, abs=1e-5)
+    assert abs(done.raised) < 1e-3

@@ -120,3 +120,23 @@ def test_the_command_prints_rates_and_refuses_what_cannot_be(
     assert main([*common, "0"]) == 2
     assert main([*common, "1", "--video", str(tmp_path / "film.avi")]) == 2
     assert ".gif or .webp" in capsys.readouterr().err
+
+
+def broken(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
+    """The second attempt with the torus ends in a fault."""
+    if obj.name == "torus" and number:
+        raise ValueError("a fault")
+    return Attempt(robot.name, obj.name, number, seed, TabletopConfig().label(), True, "done")
+
+
+def test_a_fault_loses_nothing_of_what_other_processes_make(small_robot: str, tmp_path: Path) -> None:
+    stored = tmp_path / "stored.parquet"
+    with pytest.raises(ValueError, match="a fault"):
+        run_tabletop(TabletopRun(small_robot, ("torus", "can"), attempts=2), stored, workers=2, make=broken)
+    assert sorted((a.object, a.number) for a in read_attempts(stored)) == [("can", 0), ("can", 1), ("torus", 0)]
+
+
+def test_a_bare_cloud_is_refused_before_anything_is_attempted(small_robot: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", dro.load_object("can").cloud)
+    with pytest.raises(OptionError, match="object 'cloud' is a bare cloud"):
+        run_tabletop(TabletopRun(small_robot, ("can", str(tmp_path / "cloud.npy"))), make=broken)

@@ -51,7 +51,8 @@ class Film:
     def of_plan(robot: Robot, plan: MotionPlan) -> Film:
         """A plan as it is meant: the hand carries the object from the lift on, until it puts it down, or has pushed it."""
         points = list(plan.points(RATE))
-        arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
+        of_arm, of_hand = plan.drivers
+        arm, hand = of_arm.joints(np.stack([p.arm for p in points])), of_hand.joints(np.stack([p.hand for p in points]))
         words = tuple(_staged(p.stage) for p in points)
         if plan.notes.slide is not None:
             ended = np.array([SLIDING.index(p.stage) > SLIDING.index("slide") for p in points])

@@ -151,13 +151,12 @@ def clear_table(
         judged: Called with each judgement of whether the hand holds something, when it is made.
 
     Raises:
-        RobotError: The robot has no table or no camera, or collides where it stands.
+        OptionError: The robot has no table or no camera.
+        RobotError: It collides where it stands.
         PlanError: The arm does not find its way home.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
-    if robot.table is None or robot.camera is None:
-        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
-                          "file: what is to be cleared has to be seen on one")
+    require_table_and_camera(robot)
     memory, picks, moved = Memory(config.tries), list[Pick](), None
     tell = progress or (lambda pick: None)
     while True:
@@ -179,6 +178,13 @@ def clear_table(
             tell(made.pick)
             if len(picks) >= config.most:
                 break
+
+
+def require_table_and_camera(robot: Robot) -> None:
+    """Refuse a robot whose table or camera is not known, by an OptionError."""
+    if robot.table is None or robot.camera is None:
+        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
+                          "file: what is to be cleared has to be seen on one")
 
 
 class _Look(NamedTuple):

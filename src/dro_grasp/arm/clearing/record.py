@@ -198,6 +198,7 @@ class RecordedRig:
 
     def __init__(self, rig: Rig, recorder: ClearRecorder) -> None:
         self._rig, self._recorder = rig, recorder
+        self._due = 0.0  # When the next moment is to be kept, from the begin of the next motion on [s]
 
     def look(self) -> Float[np.ndarray, "n 3"]:
         """As of `Rig`."""
@@ -208,7 +209,8 @@ class RecordedRig:
     def move(self, arm: Trajectory, hand: Trajectory) -> None:
         """As of `Rig`; what is commanded is kept."""
         self._rig.move(arm, hand)
-        times = np.arange(0.0, arm.seconds, 1 / self._recorder.rate)
+        times = np.arange(self._due, arm.seconds, 1 / self._recorder.rate)
+        self._due += len(times) / self._recorder.rate - arm.seconds
         self._recorder.frames += [(_at(arm, time), _at(hand, time), np.zeros((0, 4, 4))) for time in times]
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.arm.clearing.loop import ClearConfig, Cleared, Pick, clear_table
+from dro_grasp.arm.clearing.loop import ClearConfig, Cleared, Pick, clear_table, require_table_and_camera
 from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.physics import FRICTION, LiftScene, check_friction
 from dro_grasp.arm.planning.workcell import Workcell
-from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.camera_view import depth_image, thinned_intrinsics
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher
 from dro_grasp.arm.tabletop.table_setup import Region, scatter
@@ -112,8 +112,9 @@ def clear_trial(
     config = config or ClearTrialConfig()
     if clouds := [obj.name for obj in objects if obj.is_cloud]:
         raise OptionError(f"object '{clouds[0]}' is a bare cloud; tables are simulated, and need meshes")
-    table = robot.table or Table()
-    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(table.height)], config.friction)
+    require_table_and_camera(robot)
+    assert robot.table is not None
+    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(robot.table.height)], config.friction)
     names, nothing = tuple(obj.name for obj in objects), (False,) * len(objects)
     if not scatter(scene, config.region, np.random.default_rng([seed, number]), config.apart):
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")

@@ -18,7 +18,7 @@ from dro_grasp.arm.flat.things import height_of, lies_flat, width_of
 from dro_grasp.arm.planning.motion import MotionPlan, grasps_and_dropped
 from dro_grasp.arm.planning.placing import Place
 from dro_grasp.arm.planning.planner import Tries, first_trusted, plan
-from dro_grasp.arm.planning.task import PlanConfig, Task
+from dro_grasp.arm.planning.task import PlanConfig, Task, around
 from dro_grasp.arm.planning.workcell import moved
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
@@ -109,8 +109,12 @@ def _ways(
         return lambda: _trusted(robot, obj, obstacles, predictor, config, seed, start, place, grasps)
 
     def pushed() -> MotionPlan:
+        if config.constraints.keep_out or config.constraints.contact_region:
+            raise PlanError(f"'{obj.name}' lies flat, and is not pushed: fingers would touch it anywhere, against keep_out or "
+                            "contact_region")
         slides = SlideConfig(rehearsed=config.rehearsals > 0, friction=config.friction)
-        return slide(robot, obj, obstacles, slides, seed, None if start is None else robot.require_start(start))
+        things = [*obstacles, *around(robot, obj, config.constraints)]
+        return slide(robot, obj, things, slides, seed, None if start is None else robot.require_start(start))
 
     if overhangs(points, table):
         at_edge = replace(config, reach=replace(AT_TABLE, lift=config.reach.lift), rehearsals=config.rehearsals and REHEARSED)

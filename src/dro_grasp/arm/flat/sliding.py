@@ -7,7 +7,7 @@ down: with the same friction above and below, a thing that is pressed to its tab
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,11 +16,11 @@ from jaxtyping import Float
 
 from dro_grasp.arm.flat.grips import LEAST_OVERHANG, farthest_ahead, flat_grasps
 from dro_grasp.arm.flat.postures import ACROSS, AHEAD, OVER, WorkingHand
-from dro_grasp.arm.planning.motion import MotionPlan, PlanNotes, PlanScene
+from dro_grasp.arm.planning.motion import MotionPlan, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.planning.physics import FRICTION, Deviation, Rehearsal
 from dro_grasp.arm.planning.reachability import Reachability, ReachConfig, WristSolver
-from dro_grasp.arm.planning.trajectory import STEP, Pair, find_path, joined, smooth, still
-from dro_grasp.arm.planning.workcell import Workcell, moved
+from dro_grasp.arm.planning.trajectory import STEP, Pair, cornered, find_path, joined, smooth, still
+from dro_grasp.arm.planning.workcell import CLEARANCE, Workcell, moved
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.errors import PlanError
 from dro_grasp.kinds import Checked
@@ -34,6 +34,7 @@ LOWEST = 0.004  # Height of the part of a fingertip that meets what is lower [m]
 SHORTEST = 0.006  # Shorter pushes are none [m] (ours)
 FURTHER = 0.02  # The same for what overhangs already: small ones would creep over the edge [m] (ours)
 SEEN = 0.98  # Share of a thing that the camera sees at the edge, at least [1] (ours)
+NEARER = 0.002  # How much nearer than planned a timed motion may come to things [m] (ours): it is checked at more places
 
 
 @dataclass(frozen=True)
@@ -159,9 +160,10 @@ def slide(
         raise PlanError(f"'{obj.name}' cannot be pushed to an edge: robot '{robot.name}' has no table; state its centre and "
                         "size in the robot file")
     pusher = _Pusher(robot, obj, obstacles, config, seed, robot.home if start is None else start)
-    unseen = 0
+    unseen = blocked = 0
     for push in pushes(np.asarray(obj.cloud, np.float64), obj.centre_of_mass, table, config):
         if not pusher.is_free(push):
+            blocked += 1
             continue
         if not pusher.is_seen(push):
             unseen += 1
@@ -178,8 +180,10 @@ def slide(
         raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table at which the camera would see it: "
                         f"{unseen} pushes end outside of its image; turn the camera so that it sees an edge beside the arm, "
                         "and correct its pose in the robot file")
-    raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table to which it could be pushed; move it "
-                    "nearer to an edge that the robot reaches around, or correct the table's centre and size in the robot file")
+    in_way = f", and things stand in the way of {blocked} pushes" if blocked else ""
+    raise PlanError(f"'{obj.name}' lies flat, and the arm reaches no edge of the table to which it could be pushed{in_way}; "
+                    f"move {'them away, or move ' if blocked else ''}it nearer to an edge that the robot reaches around, or "
+                    "correct the table's centre and size in the robot file")
 
 
 Line = tuple[Float[np.ndarray, "k n_arm"], Float[np.ndarray, "m n_arm"], Float[np.ndarray, "k n_arm"]]
@@ -276,8 +280,9 @@ class _Pusher:
             if not self.cell.free(before[-1], robot.open_hand, 0.0) or not self.cell.free(after[-1], robot.open_hand, 0.0):
                 continue
             is_thin = float(np.ptp(self.points[:, 2])) < config.thin
-            ahead[:, 2, 3] -= config.hover + (config.press_thin if is_thin else config.press)
-            pressed = self.solver.follow(ahead, hovering[0])
+            lowered = ahead.copy()
+            lowered[:, 2, 3] -= config.hover + (config.press_thin if is_thin else config.press)
+            pressed = self.solver.follow(lowered, hovering[0])
             if pressed is not None:
                 return before[::-1].copy(), pressed, after
         return None
@@ -299,20 +304,25 @@ class _Pusher:
         robot, cell, config = self.robot, self.cell, self.config
         down, pressed, up = line
         opened, home = robot.open_hand, robot.home
-        found = find_path(self.start, down[:1], lambda q: cell.free(q, opened), *robot.working_range, config.path_seconds,
-                          self.seed)
-        back = find_path(up[-1], home[None], lambda q: cell.free(q, opened, 0.0, push.motion, touch=True), *robot.working_range,
-                         config.path_seconds, self.seed)
-        if found is None or back is None:
-            return None
         limits = robot.velocity, robot.acceleration
+
+        def pushed(q: Float[np.ndarray, " n_arm"], clearance: float, posture: Float[np.ndarray, " n_dof"] = opened) -> bool:
+            return cell.free(q, posture, clearance, push.motion, touch=True)
+
+        there = self._way(self.start, down[0], lambda q, kept: cell.free(q, opened, kept), CLEARANCE)
+        back = None if there is None else self._way(up[-1], home, pushed, 0.0)
+        if there is None or back is None:
+            return None
         n = len(opened)
         fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
         shape = smooth(np.stack([opened, self.pointing]), *fingers, STEP)
         unshape = smooth(np.stack([self.pointing, opened]), *fingers, STEP)
-        arms = [smooth(found[0], *limits), smooth(down, *limits, 0.5), smooth(np.stack([down[-1], pressed[0]]), *limits, 0.3),
+        if not all(cell.free(down[0], posture, 0.0) for posture in shape.position) or not all(
+                pushed(up[-1], 0.0, posture) for posture in unshape.position):
+            return None
+        arms = [there, smooth(down, *limits, 0.5), smooth(np.stack([down[-1], pressed[0]]), *limits, 0.3),
                 smooth(pressed, *limits, (push.length + config.behind) / config.speed),
-                smooth(np.concatenate([pressed[-1:], up]), *limits, 0.5), smooth(back[0], *limits)]
+                smooth(np.concatenate([pressed[-1:], up]), *limits, 0.5), back]
         pairs: list[Pair] = [
             (arms[0], still(opened, arms[0])), (still(down[0], shape), shape),
             *((arm, still(self.pointing, arm)) for arm in arms[1:5]),
@@ -320,6 +330,25 @@ class _Pusher:
         lengths = [len(arm.time) - (i > 0) for i, (arm, _) in enumerate(pairs)]
         arm, hand = (joined([pair[k] for pair in pairs]) for k in (0, 1))
         return MotionPlan(self._notes(push, pressed[0]), self._scene(), np.repeat(np.arange(len(pairs)), lengths), arm, hand)
+
+    def _way(
+        self, start: Float[np.ndarray, " n_arm"], end: Float[np.ndarray, " n_arm"],
+        free: Callable[[Float[np.ndarray, " n_arm"], float], bool], clearance: float,
+    ) -> Trajectory | None:
+        """A timed motion between two configurations that keeps nearly this distance [m], or none.
+
+        A smooth motion leaves the straight edges that were planned; where it comes too near, the arm stops at their corners.
+        """
+        robot = self.robot
+        path = find_path(
+            start, end[None], lambda q: free(q, clearance), *robot.working_range, self.config.path_seconds, self.seed)
+        if path is None:
+            return None
+        for timed in (smooth, cornered):
+            made = timed(path[0], robot.velocity, robot.acceleration)
+            if all(free(q, clearance - NEARER) for q in made.position):
+                return made
+        return None
 
     def _notes(self, push: Push, first: Float[np.ndarray, " n_arm"]) -> PlanNotes:
         robot, drivers = self.robot, self.robot.drivers

@@ -26,6 +26,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 
+PLACE = ("table", "obstacles")  # Constraints that are the robot's and the scene's
 PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 
@@ -45,7 +46,7 @@ def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator
             config.num, task.seed_of(batch), config.candidates, source=config.source,
             least_confidence=task.least_confidence(batch))
         if isinstance(directions, str) and directions == "all":
-            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)))
+            problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T)), PLACE)
             yield from (in_world(grasps, T) for grasps in predictor.rounds(problem, request))
         else:
             yield grasps_in_world(predictor, hand, obj, T, request, wanted, directions)
@@ -74,7 +75,7 @@ def grasps_in_world(
     them finds any.
     """
     T = torch.from_numpy(T_world_object).float()
-    problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))
+    problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)), PLACE)
     problems, requests = [problem], [request]
     if not isinstance(directions, str) or directions == "paper":
         asked = paper_directions(request.num) if isinstance(directions, str) else directions[:request.num]
@@ -91,7 +92,7 @@ def grasps_in_world(
             return error
 
     if len(problems) == 1:  # it uses all threads itself
-        parts = [made(problem, request)]
+        parts = [made(problems[0], request)]
     else:
         with fast_products():
             parts = side_by_side(made, problems, requests)

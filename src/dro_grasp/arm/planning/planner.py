@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -177,7 +177,11 @@ def candidates(
     if isinstance(given, GraspBatch):
         yield from (given, None)
         return
-    make = predicted(task, predictor or GraspPredictor()) if given is None else lambda batch: iter([given(task.seed_of(batch))])
+    def asked(batch: int) -> Iterator[GraspBatch]:
+        assert callable(given)
+        yield given(task.seed_of(batch))
+
+    make = predicted(task, predictor or GraspPredictor()) if given is None else asked
     for batch in range(task.config.batches):
         coming = make(batch)
         while True:
@@ -197,7 +201,8 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     tries.parts.append(grasps)
     with tries.watch("reach"):
         if task.constraints != Constraints():  # table and obstacles are the arm's affair
-            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(np.linalg.inv(task.T)))
+            bare = replace(task.obj, table=None)
+            problem = GraspProblem(task.robot.hand, bare, constraints=task.constraints.moved(np.linalg.inv(task.T)))
             for reason, wrong in violations(problem, task.at_object(grasps)).items():
                 for row in wrong.nonzero()[:, 0].tolist():
                     tries.dropped.setdefault(first + row, reason)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from dro_grasp.arm.planning.physics import DEVIATIONS, FRICTION, Deviation, Rehearsal, check_friction
-from dro_grasp.arm.planning.placing import Place, Places, Placing
+from dro_grasp.arm.planning.placing import Place, Places, Placing, height_below
 from dro_grasp.arm.planning.reachability import Reachability, ReachConfig
 from dro_grasp.arm.planning.workcell import Workcell, moved, scene_solid, upright
 from dro_grasp.arm.robots.robot import Robot, Table
@@ -98,6 +98,8 @@ class PlanConfig(Checked):
         check_confidence(self.least_confidence or 0.0)
         check_confidence(self.doubtful)
         check_friction(self.friction)
+        if not self.deviations and self.rehearsals:
+            raise OptionError("there are no deviations to rehearse lifts with; give one at least, or rehearsals=0")
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
@@ -127,9 +129,7 @@ class Task:
         obj, T = upright(obj, T_world_object)
         if robot.table is None:
             robot = replace(robot, table=table_below(robot, obj, T))
-        if (scene := config.constraints.obstacles) is not None:
-            reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
-            obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
+        obstacles = [*obstacles, *around(robot, obj, config.constraints)]
         first = robot.home if start is None else robot.require_start(start)
         return Task(
             Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed, first, place,
@@ -221,11 +221,23 @@ class Task:
                 "for more grasps (num=...), or for other palm directions (directions=...)")
 
 
+def around(robot: Robot, obj: ObjectModel, constraints: Constraints) -> list[ObjectModel]:
+    """What the constraints say stands around, as far as the robot gets with the object, as things in the world."""
+    if (scene := constraints.obstacles) is None:
+        return []
+    reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
+    return scene_solid(scene, robot.T_world_base[:3, 3], reach)
+
+
 def table_below(robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> Table:
-    """What an object stands on where nothing else is known: a level square below it, which leaves room for the arm's base."""
+    """What an object stands on where nothing else is known: a level square below it, which leaves room for the arm's base.
+
+    Its height is that of the table in the object's cloud, if one was seen, else of the object's lowest point.
+    """
     points = obj.cloud @ T_world_object[:3, :3].T + T_world_object[:3, 3]
     low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
     middle = (low[:2] + high[:2]) / 2
     room = float(np.abs(middle - robot.T_world_base[:2, 3]).max()) - BASE_ROOM
     half = max(float((high[:2] - low[:2]).max()) / 2 + SURROUNDS, min(room, ASSUMED_EXTENT / 2))
-    return Table(float(low[2]), (float(middle[0]), float(middle[1])), (2 * half, 2 * half))
+    seen = height_below(obj, T_world_object)
+    return Table(float(low[2]) if seen is None else seen, (float(middle[0]), float(middle[1])), (2 * half, 2 * half))

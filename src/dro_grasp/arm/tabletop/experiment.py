@@ -38,7 +38,7 @@ from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 
-LABEL = "tabletop/10 "
+LABEL = "tabletop/11 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 16  # Most pushes of a flat thing towards an edge (ours)
@@ -86,6 +86,9 @@ class TabletopConfig(Checked):
         if wanted.obstacles is not None or wanted.contact_region or wanted.keep_out:
             raise OptionError("objects of attempts come to rest anywhere, so that obstacles, contact_region and keep_out say "
                               "nothing there; leave them out, or use dro_grasp.plan for one object in its place")
+        if not isinstance(self.plan.source, str):
+            raise OptionError(f"the plan's source is {self.plan.source!r}; attempts are stored with their settings, so give a "
+                              "name, such as 'network' or 'module:name'")
         depth_noise(self.noise)
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
@@ -166,6 +169,7 @@ def attempt(
     result = replace(result, place=json.dumps(start.round(6).tolist()))
     try:
         while True:
+            result = replace(result, stage="see")
             begin, processor = time.perf_counter(), time.process_time()
             seen, T = _see(scene, config, int(draw.integers(2**31)))
             see_seconds = time.perf_counter() - begin
@@ -179,10 +183,14 @@ def attempt(
                 made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
             if made.notes.slide is None:
                 break
+            if result.pushes >= PUSHES:
+                told = f"the object is not ready to be taken at the edge after {PUSHES} pushes"
+                return replace(result, stage="slide", reason=told)
             if watch is not None:
                 watch.planned(seen, made)
             if (result := _pushed(result, scene, made, watch)).reason:
                 return result
+            start = scene.pose(0)
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -208,8 +216,6 @@ def _pushed(result: Attempt, scene: LiftScene, made: MotionPlan, watch: Watcher 
     table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
     if scene.pose(0)[2, 3] < table.height - FALLEN:
         return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
-    if result.pushes > PUSHES:
-        return replace(result, stage="slide", reason=f"the object is not ready to be taken at the edge after {PUSHES} pushes")
     return result
 
 
@@ -284,5 +290,10 @@ def _check(robot: Robot, obj: ObjectModel, config: TabletopConfig) -> None:
     if robot.table is None or (config.see == "cloud" and robot.camera is None):
         raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
                           "file: attempts need both")
+    require_mesh(obj)
+
+
+def require_mesh(obj: ObjectModel) -> None:
+    """Refuse a bare cloud, by an OptionError."""
     if obj.is_cloud:
         raise OptionError(f"object '{obj.name}' is a bare cloud; attempts are simulated, and need a mesh")

@@ -12,7 +12,7 @@ from typing import Any
 from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts, write_attempts
-from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher, attempt
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher, attempt, require_mesh
 from dro_grasp.arm.tabletop.table_scene import PickedObject
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import OptionError
@@ -122,10 +122,11 @@ def _done(
 
 
 def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """What each object was given as, and its hashes, by its name."""
+    """What each object was given as, and its hashes, by its name; a bare cloud is refused."""
     found: dict[str, tuple[str, str, str]] = {}
     for source in dict.fromkeys(given):
         obj = load_object(source)
+        require_mesh(obj)
         first, _, solid = found.setdefault(obj.name, (source, obj.sha256, obj.solid_sha256))
         if obj.solid_sha256 != solid:
             raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
@@ -141,14 +142,26 @@ def _results(
         for name, numbers in missing.items():
             yield from _attempts(run, name, numbers, plans, make)
         return
+    faults = list[Exception]()
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         for future in as_completed([pool.submit(_all_attempts, run, *item, plans, make) for item in missing.items()]):
-            yield from future.result()
+            made, fault = future.result()
+            yield from made
+            faults += [] if fault is None else [fault]
+    if faults:  # once nothing of the others is lost
+        raise faults[0]
 
 
-def _all_attempts(*task: Any) -> list[Attempt]:
+def _all_attempts(*task: Any) -> tuple[list[Attempt], Exception | None]:
+    """Attempts with an object, and what ended them too early."""
+    made = list[Attempt]()
     with one_thread():
-        return list(_attempts(*task))
+        try:
+            for one in _attempts(*task):
+                made.append(one)
+        except Exception as fault:
+            return made, fault
+    return made, None
 
 
 def _attempts(
