@@ -243,3 +243,11 @@ def test_a_table_and_a_camera_are_needed(robot: dro.Robot, lacking: str) -> None
     can = dro.load_object("can")
     with pytest.raises(OptionError, match=f"has no {lacking}; state it in the robot file"):
         clear_trial(replace(robot, **{lacking: None}), [can], 0, 0, dro.GraspPredictor())
+
+
+def test_a_can_is_cleared_from_a_table_in_simulation(robot: dro.Robot) -> None:
+    """Nothing is made up: camera, plan, motion, joints and bin."""
+    done = clear_trial(robot, [dro.load_object("can")], 0, 0, dro.GraspPredictor())
+    assert (done.removed, done.fallen, done.reason) == ((True,), (False,), "")
+    assert done.cleared.done == len(done.cleared.picks) == 1
+    assert all(state == "held" and held for state, held in done.judgements)

@@ -113,8 +113,9 @@ def clear_trial(
     if clouds := [obj.name for obj in objects if obj.is_cloud]:
         raise OptionError(f"object '{clouds[0]}' is a bare cloud; tables are simulated, and need meshes")
     require_table_and_camera(robot)
-    assert robot.table is not None
-    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(robot.table.height)], config.friction)
+    table = robot.table
+    assert table is not None
+    scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(table.height)], config.friction)
     names, nothing = tuple(obj.name for obj in objects), (False,) * len(objects)
     if not scatter(scene, config.region, np.random.default_rng([seed, number]), config.apart):
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
