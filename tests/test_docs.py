@@ -72,7 +72,7 @@ def test_commands_are_understood(command: str) -> None:
         assert (ROOT / words[0]).stat().st_mode & 0o100, "not executable"
         assert variables.keys() <= set(re.findall(r"^#   ([A-Z]+) ", (ROOT / words[0]).read_text(), re.MULTILINE))
     else:
-        assert words[0] in {"git", "cd", "pip", "source"}, command
+        assert words[0] in {"git", "cd", "mkdir", "pip", "source"}, command
 
 
 def assert_folders_exist(command: object) -> None:

@@ -47,6 +47,7 @@ class Size:
     """Of a pair: of training hands, of those on procedural objects, of made-up hands, of held-out ones."""
     labelled: str  # by which grasps are labels that hold
     shipped: str  # older grasps, which become labels by the filter
+    most_shipped: int  # of a pair of these
     per_pair: int  # grasps in the training bundle
     pretraining: str
     training: str
@@ -62,7 +63,7 @@ FIRST_MADE = 100
 FULL = Size(
     hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
     validate=("assets:validate",), procedural="procedural:0-399", part="1/19", grasps=(60, 8, 12, 50),
-    labelled="--also robust --resettle", shipped="data/grasps", per_pair=40, pretraining="--steps 6000 --motion-steps 10000",
+    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=75, per_pair=40, pretraining="--steps 6000 --motion-steps 10000",
     training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
     "--learning-rate 7e-4",
     placement="--steps 2600 --partial 0.25",
@@ -72,7 +73,7 @@ FULL = Size(
     completion="--objects assets:train builtin:train procedural:0-99 --steps 6000", into=PACKAGED)
 TINY = Size(
     hands=("gripper3",), held_out=(), made=2, known=("can", "torus"), validate=(), procedural="procedural:0-0",
-    part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", per_pair=6,
+    part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", most_shipped=6, per_pair=6,
     pretraining="--preset slim --steps 4 --motion-steps 4",
     training="--preset slim --steps 8 --shards 2 --samples-per-hand 2 --validation-samples 10", placement="--steps 4",
     ranking="--groups can torus sphere --objects 2 --num 8 --trials carry --views whole --steps 100",
@@ -116,7 +117,8 @@ def labels(size: Size, folder: str) -> list[Step]:
     """Older grasps by the same measure, in `FOLDER/labels`, and all of them in one file a hand, in `FOLDER/grasps`."""
     made = " ".join(f"{folder}/data/{step.name}" for step in data(size, folder) if step.share)
     return [
-        Step("labels", f"dro-grasp dataset filter {size.shipped} --protocol carry --also robust --resettle --again "
+        Step("shipped", f"dro-grasp dataset merge {size.shipped} --output {folder}/shipped --per-pair {size.most_shipped}"),
+        Step("labels", f"dro-grasp dataset filter {folder}/shipped --protocol carry --also robust --resettle --again "
              f"--output {folder}/labels", free="--workers {workers}"),
         Step("grasps", f"dro-grasp dataset merge {made} {folder}/labels --output {folder}/grasps --per-pair 150"),
         Step("card", f"python -m lab.benchmarks.data_card {folder}/grasps"),
