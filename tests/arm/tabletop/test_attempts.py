@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 import dro_grasp as dro
-from dro_grasp.arm.planning.motion import MotionPlan
+from dro_grasp.arm.planning.motion import SLIDING, MotionPlan
 from dro_grasp.arm.planning.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.workcell import Workcell
@@ -228,11 +228,10 @@ def test_a_thing_is_judged_from_where_pushes_left_it_and_they_have_an_end(
         made.append(replace(planned, notes=replace(planned.notes, slide=np.eye(4).tolist() if pushing else None)))
         return made[-1]
 
-    def push(result: Attempt, scene: LiftScene, *others: object) -> Attempt:
+    def push(scene: LiftScene, *others: object) -> None:
         T = scene.pose(0)
-        T[0, 3] += 0.05
+        T[0, 3] += 0.05 / len(SLIDING)
         scene.place(0, T)
-        return replace(result, pushes=result.pushes + 1)
 
     def judged(result: Attempt, scene: LiftScene, start: np.ndarray, plan: MotionPlan) -> Attempt:
         starts.append(start)
@@ -240,7 +239,7 @@ def test_a_thing_is_judged_from_where_pushes_left_it_and_they_have_an_end(
 
     monkeypatch.setattr(experiment, "may_slide", lambda *_: True)
     monkeypatch.setattr(experiment, "plan_or_slide", plans)
-    monkeypatch.setattr(experiment, "_pushed", push)
+    monkeypatch.setattr(LiftScene, "follow", push)
     monkeypatch.setattr(experiment, "carry_out", lambda *_: ("done", ""))
     monkeypatch.setattr(experiment, "measured", judged)
     done = attempt(robot, can, 0, 0, dro.GraspPredictor(), TabletopConfig(see="mesh", place=True))

@@ -183,12 +183,7 @@ def attempt(
                 made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
             if made.notes.slide is None:
                 break
-            if result.pushes >= PUSHES:
-                told = f"the object is not ready to be taken at the edge after {PUSHES} pushes"
-                return replace(result, stage="slide", reason=told)
-            if watch is not None:
-                watch.planned(seen, made)
-            if (result := _pushed(result, scene, made, watch)).reason:
+            if (result := _pushed(result, scene, seen, made, watch)).reason:
                 return result
             start = scene.pose(0)
     except DroGraspError as error:
@@ -209,8 +204,14 @@ def attempt(
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
-def _pushed(result: Attempt, scene: LiftScene, made: MotionPlan, watch: Watcher | None) -> Attempt:
-    """An attempt after a push to the table's edge."""
+def _pushed(
+    result: Attempt, scene: LiftScene, seen: PickedObject, made: MotionPlan, watch: Watcher | None
+) -> Attempt:
+    """An attempt after a push to the table's edge, or why there is none."""
+    if result.pushes >= PUSHES:
+        return replace(result, stage="slide", reason=f"the object is not ready to be taken at the edge after {PUSHES} pushes")
+    if watch is not None:
+        watch.planned(seen, made)
     for stage in SLIDING:
         scene.follow(made.arm, made.hand, made.part(stage), None if watch is None else lambda: watch.moved(scene))
     table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
