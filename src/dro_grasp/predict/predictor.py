@@ -17,7 +17,6 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.errors import NoGraspError, OptionError
-from dro_grasp.geometry.distance_field import Ball
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
@@ -26,9 +25,8 @@ from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimize.starts import Direction
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
-from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.constraints import BallRows, Constraints, Vector
 from dro_grasp.predict.finish import FinishConfig, Finished, complete_grasps, finish_all
 from dro_grasp.predict.problem import GraspProblem, problems_of
 from dro_grasp.predict.settling import can_settle
@@ -105,8 +103,8 @@ class GraspPredictor:
     @renamed(**FORMER_CONSTRAINTS)
     def predict(
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
-        direction: Direction | None = None, max_tilt: float | None = None, table: float | None = None,
-        obstacles: Scene | None = None, contact_region: tuple[Ball, ...] = (), keep_out: tuple[Ball, ...] = (),
+        direction: Vector | None = None, max_tilt: float | None = None, table: float | None = None,
+        obstacles: Scene | None = None, contact_region: BallRows = (), keep_out: BallRows = (),
         pregrasp_clearance: float | None = None, touch_table: bool | None = None, margin: float | None = None,
         max_force: float | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
@@ -147,7 +145,7 @@ class GraspPredictor:
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
                  "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance,
                  "touch_table": touch_table, "margin": margin, "max_force": max_force}
-        asked = {name: x for name, x in given.items() if x is not None and not (isinstance(x, tuple) and x == ())}
+        asked = {name: x for name, x in given.items() if x is not None and not (isinstance(x, Sequence) and not x)}
         wanted = replace(constraints or Constraints(), **asked)
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:
