@@ -15,6 +15,7 @@ from dro_grasp.arm.clearing.loop import Bin, ClearConfig, Pick, clear_table
 from dro_grasp.arm.clearing.trial import clear_trial
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.planning.placing import Place
+from dro_grasp.arm.planning.workcell import CLEARANCE, Workcell
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.grasps.hold import HoldCheck
 
@@ -124,6 +125,23 @@ def test_everything_is_picked_and_dropped_above_the_bin(world: Any, robot: dro.R
         assert walls.name == "bin"
         assert len(own.obstacles) == (2 if own is asked[0] else 1), "the other thing is in the way"
     np.testing.assert_allclose(table.moves[-1].position[-1], robot.home, atol=1e-6)
+
+
+def test_the_way_home_is_checked_as_it_is_timed(robot: dro.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A spline leaves the straight edges; where that is not free, or nothing is, the arm does not follow it."""
+    table, asked = Table(robot, []), list[float]()
+    away = np.zeros(1), np.tile(robot.home + 0.3, (1, 1))
+    table.moves.append(Trajectory(*away, 0 * away[1], 0 * away[1]))
+
+    def free(cell: Workcell, arm: np.ndarray, hand: np.ndarray, clearance: float = CLEARANCE) -> bool:
+        asked.append(clearance)
+        return clearance == CLEARANCE
+
+    monkeypatch.setattr(Workcell, "free", free)
+    with pytest.raises(PlanError, match="the arm does not find its way home"):
+        loop._go_home(table, Workcell(robot))
+    assert len(table.moves) == 1
+    assert 0 < min(asked) < CLEARANCE
 
 
 def test_what_is_lost_is_looked_for_and_tried_again(world: Any, robot: dro.Robot, placed: MotionPlan) -> None:

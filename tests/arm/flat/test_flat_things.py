@@ -13,13 +13,13 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.apps.viewer.lift_page import Film
-from dro_grasp.arm.flat import plans, sliding
+from dro_grasp.arm.flat import plans
 from dro_grasp.arm.flat.grips import flat_grasps, overhangs
 from dro_grasp.arm.flat.plans import plan_or_slide
 from dro_grasp.arm.flat.postures import AHEAD, OVER, WorkingHand, flat_grips
 from dro_grasp.arm.flat.sliding import SlideConfig, _Pusher, pushes, slide
 from dro_grasp.arm.flat.things import flat_object, overhang, seen_flat, width_of
-from dro_grasp.arm.planning.motion import SLIDING, MotionPlan, Trajectory
+from dro_grasp.arm.planning.motion import SLIDING, MotionPlan
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
@@ -392,25 +392,3 @@ def test_a_line_that_cannot_be_pressed_is_tried_from_another_start_as_it_was(
     assert pusher._solved(T, np.array([0.1, 0.0, 0.0])) is None
     assert heights[0::4] == [0.3] * 3
     assert heights[3::4] == pytest.approx([0.3 - SlideConfig().hover - SlideConfig().press] * 3)
-
-
-def test_an_arm_stops_at_corners_where_a_smooth_way_comes_too_near(
-    narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPlan], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    thing, _ = pushed
-    pusher, end = _Pusher(narrow, thing, (), SlideConfig(), 0, narrow.home), narrow.home + 0.2
-
-    def free(q: np.ndarray, clearance: float) -> bool:
-        return bool(q[0] <= end[0] + 1e-9)
-
-    def swinging(waypoints: np.ndarray, *limits: object) -> Trajectory:
-        beyond = np.stack([waypoints[0], waypoints[-1] + 0.1, waypoints[-1]])
-        return Trajectory(np.arange(3.0), beyond, 0 * beyond, 0 * beyond)
-
-    assert len(pusher._way(narrow.home, end, free, 0.0).time) > 3  # type: ignore[union-attr]
-    monkeypatch.setattr(sliding, "smooth", swinging)
-    made = pusher._way(narrow.home, end, free, 0.0)
-    assert made is not None
-    assert len(made.time) > 3
-    monkeypatch.setattr(sliding, "cornered", swinging)
-    assert pusher._way(narrow.home, end, free, 0.0) is None

@@ -8,9 +8,21 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.arm.planning.motion import STAGES, MotionPlan
+from dro_grasp.arm.planning.motion import STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.planning.reachability import Feasible, Postures
-from dro_grasp.arm.planning.trajectory import STEP, USED, cornered, find_path, smooth, standing as standing_still, timed_stages
+from dro_grasp.arm.planning.trajectory import (
+    NEARER,
+    STEP,
+    USED,
+    cornered,
+    densified,
+    find_path,
+    free_motion,
+    smooth,
+    standing as standing_still,
+    timed_stages,
+    timed_way,
+)
 from dro_grasp.arm.planning.workcell import Workcell
 
 
@@ -51,6 +63,40 @@ def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
     assert slow.seconds == pytest.approx(20.0, abs=0.05)
     assert np.abs(slow.position[np.abs(slow.time - 10.0).argmin()] - corners[1]).max() < 1e-3
     assert cornered(corners[[0, 0]], np.ones(2), np.ones(2), 0.5).seconds == pytest.approx(0.5)
+
+
+def test_an_arm_stops_at_corners_only_where_a_smooth_way_is_not_free() -> None:
+    corners = densified(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), 0.2)
+
+    def on_lines(way: Trajectory) -> bool:
+        return np.minimum(np.abs(way.position[:, 1]), np.abs(way.position[:, 0] - 1)).max() < 1e-6
+
+    smooth_way = timed_way(corners, np.ones(2), np.ones(2), lambda way: True)
+    stopping = timed_way(corners, np.ones(2), np.ones(2), on_lines, 9.0)
+    assert smooth_way is not None
+    assert stopping is not None
+    assert not on_lines(smooth_way)
+    assert on_lines(stopping)
+    assert smooth_way.seconds < cornered(corners, np.ones(2), np.ones(2)).seconds
+    assert stopping.seconds == pytest.approx(9.0, abs=0.05)
+    assert timed_way(corners, np.ones(2), np.ones(2), lambda way: False) is None
+
+
+def test_a_free_motion_keeps_its_distance_as_planned_and_nearly_as_timed(robot: dro.Robot) -> None:
+    end, asked = robot.home + 0.2, list[tuple[float, float]]()
+
+    def free(q: np.ndarray, kept: float) -> bool:
+        asked.append((float(q[0]), kept))
+        return kept > 0.003 or timed_is_free
+
+    timed_is_free = True
+    made = free_motion(robot, robot.home, end, free, 2.0, 0, 0.006)
+    assert made is not None
+    np.testing.assert_allclose(made.position[[0, -1]], [robot.home, end], atol=1e-9)
+    assert {kept for _, kept in asked} == {0.006, 0.006 - NEARER}
+    assert {q for q, kept in asked if kept < 0.006} == set(made.position[:, 0].tolist())
+    timed_is_free = False
+    assert free_motion(robot, robot.home, end, free, 2.0, 0, 0.006) is None
 
 
 def test_a_closing_hand_stays_between_its_postures() -> None:

@@ -19,7 +19,7 @@ from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajector
 from dro_grasp.arm.planning.placing import Place
 from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.arm.planning.trajectory import find_path, smooth, standing, still
+from dro_grasp.arm.planning.trajectory import free_motion, smooth, standing, still
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object, seen_on_table
@@ -156,7 +156,7 @@ def clear_table(
         PlanError: The arm does not find its way home.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
-    require_table_and_camera(robot)
+    robot.require_table()
     memory, picks, moved = Memory(config.tries), list[Pick](), None
     tell = progress or (lambda pick: None)
     while True:
@@ -178,13 +178,6 @@ def clear_table(
             tell(made.pick)
             if len(picks) >= config.most:
                 break
-
-
-def require_table_and_camera(robot: Robot) -> None:
-    """Refuse a robot whose table or camera is not known, by an OptionError."""
-    if robot.table is None or robot.camera is None:
-        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
-                          "file: what is to be cleared has to be seen on one")
 
 
 class _Look(NamedTuple):
@@ -312,15 +305,12 @@ def _go_home(rig: Rig, cell: Workcell) -> None:
     """
     robot = cell.robot
     arm, opened = rig.joints()[0], robot.open_hand
-    found = None
     for around in (cell, Workcell(robot)):  # what it touches where it is may be noise, or may give way
-        def free(q: Float[np.ndarray, " n_arm"], around: Workcell = around) -> bool:
-            return around.free(q, opened)
+        def free(q: Float[np.ndarray, " n_arm"], kept: float, around: Workcell = around) -> bool:
+            return around.free(q, opened, kept)
 
-        if (found := find_path(arm, robot.home[None], free, *robot.working_range, HOME_SECONDS, 0)) is not None:
-            break
-    if found is None:
-        met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
-        raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")
-    way = smooth(found[0], robot.velocity, robot.acceleration)
-    rig.move(way, still(opened, way))
+        if (way := free_motion(robot, arm, robot.home, free, HOME_SECONDS, 0)) is not None:
+            rig.move(way, still(opened, way))
+            return
+    met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
+    raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.arm.clearing.loop import ClearConfig, Cleared, Pick, clear_table, require_table_and_camera
+from dro_grasp.arm.clearing.loop import ClearConfig, Cleared, Pick, clear_table
 from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.physics import FRICTION, LiftScene, check_friction
 from dro_grasp.arm.planning.workcell import Workcell
@@ -112,7 +112,7 @@ def clear_trial(
     config = config or ClearTrialConfig()
     if clouds := [obj.name for obj in objects if obj.is_cloud]:
         raise OptionError(f"object '{clouds[0]}' is a bare cloud; tables are simulated, and need meshes")
-    require_table_and_camera(robot)
+    robot.require_table()
     table = robot.table
     assert table is not None
     scene = LiftScene(Workcell(robot), objects, [config.clear.bin.walls(table.height)], config.friction)

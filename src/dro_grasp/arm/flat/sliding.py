@@ -7,7 +7,7 @@ down: with the same friction above and below, a thing that is pressed to its tab
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,11 +16,11 @@ from jaxtyping import Float
 
 from dro_grasp.arm.flat.grips import LEAST_OVERHANG, farthest_ahead, flat_grasps
 from dro_grasp.arm.flat.postures import ACROSS, AHEAD, OVER, WorkingHand
-from dro_grasp.arm.planning.motion import MotionPlan, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.planning.motion import MotionPlan, PlanNotes, PlanScene
 from dro_grasp.arm.planning.physics import FRICTION, Deviation, Rehearsal
 from dro_grasp.arm.planning.reachability import Reachability, ReachConfig, WristSolver
-from dro_grasp.arm.planning.trajectory import STEP, Pair, cornered, find_path, joined, smooth, still
-from dro_grasp.arm.planning.workcell import CLEARANCE, Workcell, moved
+from dro_grasp.arm.planning.trajectory import STEP, Pair, free_motion, joined, smooth, still
+from dro_grasp.arm.planning.workcell import Workcell, moved
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.errors import PlanError
 from dro_grasp.kinds import Checked
@@ -33,8 +33,8 @@ AT_TABLE = ReachConfig(table_margin=-0.002, clearance=0.0, deepest=0.05)
 LOWEST = 0.004  # Height of the part of a fingertip that meets what is lower [m] (ours)
 SHORTEST = 0.006  # Shorter pushes are none [m] (ours)
 FURTHER = 0.02  # The same for what overhangs already: small ones would creep over the edge [m] (ours)
+LEAVING = 0.002  # Distance from what was pushed that the arm keeps on its way home [m] (ours)
 SEEN = 0.98  # Share of a thing that the camera sees at the edge, at least [1] (ours)
-NEARER = 0.002  # How much nearer than planned a timed motion may come to things [m] (ours): it is checked at more places
 
 
 @dataclass(frozen=True)
@@ -309,8 +309,9 @@ class _Pusher:
         def pushed(q: Float[np.ndarray, " n_arm"], clearance: float, posture: Float[np.ndarray, " n_dof"] = opened) -> bool:
             return cell.free(q, posture, clearance, push.motion, touch=True)
 
-        there = self._way(self.start, down[0], lambda q, kept: cell.free(q, opened, kept), CLEARANCE)
-        back = None if there is None else self._way(up[-1], home, pushed, 0.0)
+        there = free_motion(
+            robot, self.start, down[0], lambda q, kept: cell.free(q, opened, kept), config.path_seconds, self.seed)
+        back = None if there is None else free_motion(robot, up[-1], home, pushed, config.path_seconds, self.seed, LEAVING)
         if there is None or back is None:
             return None
         n = len(opened)
@@ -330,25 +331,6 @@ class _Pusher:
         lengths = [len(arm.time) - (i > 0) for i, (arm, _) in enumerate(pairs)]
         arm, hand = (joined([pair[k] for pair in pairs]) for k in (0, 1))
         return MotionPlan(self._notes(push, pressed[0]), self._scene(), np.repeat(np.arange(len(pairs)), lengths), arm, hand)
-
-    def _way(
-        self, start: Float[np.ndarray, " n_arm"], end: Float[np.ndarray, " n_arm"],
-        free: Callable[[Float[np.ndarray, " n_arm"], float], bool], clearance: float,
-    ) -> Trajectory | None:
-        """A timed motion between two configurations that keeps nearly this distance [m], or none.
-
-        A smooth motion leaves the straight edges that were planned; where it comes too near, the arm stops at their corners.
-        """
-        robot = self.robot
-        path = find_path(
-            start, end[None], lambda q: free(q, clearance), *robot.working_range, self.config.path_seconds, self.seed)
-        if path is None:
-            return None
-        for timed in (smooth, cornered):
-            made = timed(path[0], robot.velocity, robot.acceleration)
-            if all(free(q, clearance - NEARER) for q in made.position):
-                return made
-        return None
 
     def _notes(self, push: Push, first: Float[np.ndarray, " n_arm"]) -> PlanNotes:
         robot, drivers = self.robot, self.robot.drivers

@@ -16,13 +16,15 @@ from jaxtyping import Float, Int
 
 from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.reachability import Feasible, Postures, Put, carried
-from dro_grasp.arm.planning.workcell import CARRIED, Workcell
+from dro_grasp.arm.planning.workcell import CARRIED, CLEARANCE, Workcell
+from dro_grasp.arm.robots.robot import Robot
 
 SPACING = 0.08  # Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)
 STEP = 0.01  # Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
 
+NEARER = 0.004  # How much nearer than planned a timed motion may come to things [m] (ours): it is checked at more places
 CARRY_SPEED = 0.5  # Share of the arm's velocities with which it carries an object [1] (ours): it is held by friction alone
 CARRY_ACCELERATION = 0.25  # The same of its accelerations [1] (ours)
 LOWER_SECONDS = 1.5  # Least time in which an object is lowered [s] (ours)
@@ -92,6 +94,28 @@ def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.nda
     return np.concatenate([*pieces, corners[-1:]])
 
 
+def free_motion(
+    robot: Robot, start: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"],
+    free: Callable[[Float[np.ndarray, " n"], float], bool], seconds: float, seed: int, clearance: float = CLEARANCE,
+) -> Trajectory | None:
+    """A timed motion of the arm between two free configurations; None if none is found.
+
+    Args:
+        robot: Its limits hold.
+        start: Where it begins [rad or m].
+        end: Where it ends.
+        free: Whether a configuration keeps a distance [m] from things.
+        seconds: Longest time for the path.
+        seed: See `find_path`.
+        clearance: Distance that the path keeps [m].
+    """
+    found = find_path(start, end[None], lambda q: free(q, clearance), *robot.working_range, seconds, seed)
+    if found is None:
+        return None
+    return timed_way(found[0], robot.velocity, robot.acceleration,
+                     lambda way: all(free(q, clearance - NEARER) for q in way.position))
+
+
 def timed_stages(
     cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures, closing_seconds: float,
     grip_seconds: float, carry: Float[np.ndarray, "j n_arm"] | None = None,
@@ -127,19 +151,17 @@ def _lifting(
     fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
 
     def clear(reach: Trajectory) -> bool:
-        """A smooth motion leaves the straight edges that were planned; it keeps a distance of 1 mm (ours)."""
-        return all(cell.free(q, hand.opened, 0.001) for q in reach.position)
+        return all(cell.free(q, hand.opened, CLEARANCE - NEARER) for q in reach.position)
 
-    reach = smooth(waypoints, *limits)
-    if not clear(reach):
-        reach = cornered(waypoints, *limits)
+    if (reach := timed_way(waypoints, *limits, clear)) is None:
+        return None
     standoff, grasp = goal.approach[0], goal.approach[-1]
     shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers, STEP)  # each stage takes time, also if nothing moves
     # A spline through these would swing beyond them, and out of the joints' range.
     close = joined([cornered(hand.closing, *fingers, closing_seconds), standing(hand.squeeze, grip_seconds)])
     approach, lift = smooth(goal.approach, *limits, STEP), smooth(goal.lift, *limits, STEP)
     start, to_grasp = robot.T_world_wrist(grasp), np.linspace(hand.pregrasp, hand.grasp, CLOSING_CHECKS)
-    free = clear(reach) and all(
+    free = all(
         cell.free(standoff, posture, 0.0) for posture in shape.position) and all(
         cell.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
         cell.free(grasp, posture, 0.0, touch=True) for posture in to_grasp) and all(
@@ -168,9 +190,8 @@ def _placing(
             cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), put.T_grasp), touch=True, kept=kept, aimed=True)
             for q in way.position)
 
-    carry = smooth(waypoints, *gentle, STEP)
-    if not clear(carry, CARRIED / 2):  # it leaves the straight edges that were planned
-        carry = cornered(waypoints, *gentle, STEP)
+    if (carry := timed_way(waypoints, *gentle, lambda way: clear(way, CARRIED / 2), STEP)) is None:
+        return None
     lower = smooth(put.lower, *gentle, LOWER_SECONDS)
     release = cornered(np.stack([hand.squeeze, hand.grasp, put.released]), *fingers, RELEASE_SECONDS)
     back = smooth(put.retreat, *limits, RETREAT_SECONDS)
@@ -178,7 +199,7 @@ def _placing(
     place, end = put.lower[-1], put.retreat[-1]
     opens = all(
         cell.free(place, posture, 0.0, put.moved, touch=True, kept=put.kept, aimed=True) for posture in release.position)
-    free = clear(carry, CARRIED / 2) and clear(lower, put.kept) and opens and all(
+    free = clear(lower, put.kept) and opens and all(
         cell.free(q, put.released, 0.0, put.moved, touch=True, kept=put.kept) for q in back.position) and all(
         cell.free(end, posture, 0.0, put.moved, kept=put.kept) for posture in opening.position)
     if not free:
@@ -186,6 +207,21 @@ def _placing(
     retreat = joined([back, still(end, opening)]), joined([still(put.released, back), opening])
     return [(carry, still(hand.squeeze, carry)), (lower, still(hand.squeeze, lower)), (still(place, release), release),
             retreat]
+
+
+def timed_way(
+    waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
+    free: Callable[[Trajectory], bool], least_seconds: float = 0.0,
+) -> Trajectory | None:
+    """The quickest motion along planned waypoints that is free as it is timed; None if there is none.
+
+    A smooth motion leaves the straight edges that were planned; where that takes it into something, the arm stops at their
+    corners.
+    """
+    for timed in (smooth, cornered):
+        if free(made := timed(waypoints, velocity, acceleration, least_seconds)):
+            return made
+    return None
 
 
 def still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:

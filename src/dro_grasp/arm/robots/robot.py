@@ -131,6 +131,13 @@ class Robot:
                                   f"within {low:.4g} to {high:.4g}; turn it back, or state another `home`")
         return found
 
+    def require_table(self, camera: bool = True) -> None:
+        """Refuse a robot whose table is not known, or whose camera is not, where it needs one, by an OptionError."""
+        missing = "table" if self.table is None else "camera" if camera and self.camera is None else None
+        if missing is not None:
+            raise OptionError(f"robot '{self.name}' has no {missing}; state it in the robot file: things lie on the table, and "
+                              "the camera sees them")
+
     @property
     def open_hand(self) -> Float[np.ndarray, " n_dof"]:
         """The posture in which the hand travels [rad or m]."""

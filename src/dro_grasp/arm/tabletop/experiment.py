@@ -157,7 +157,8 @@ def attempt(
         OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
     """
     config = config or TabletopConfig()
-    _check(robot, obj, config)
+    robot.require_table(camera=config.see == "cloud")
+    require_mesh(obj)
     obj = obj if config.mass is None else with_mass(obj, config.mass)
     others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
     scene = LiftScene(Workcell(robot), [obj, *others], friction=config.friction)
@@ -285,13 +286,6 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
 
 def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
     return float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
-
-
-def _check(robot: Robot, obj: ObjectModel, config: TabletopConfig) -> None:
-    if robot.table is None or (config.see == "cloud" and robot.camera is None):
-        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
-                          "file: attempts need both")
-    require_mesh(obj)
 
 
 def require_mesh(obj: ObjectModel) -> None:
