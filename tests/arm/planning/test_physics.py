@@ -14,7 +14,16 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.arm.clearing.trial import ClearTrialConfig
 from dro_grasp.arm.planning.candidates import grasps_in_world
-from dro_grasp.arm.planning.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
+from dro_grasp.arm.planning.physics import (
+    DEVIATIONS,
+    GUESSED_FROM,
+    MEMORY,
+    SEEN_WITHIN,
+    Deviation,
+    LiftScene,
+    Rehearsal,
+    guessed_farther,
+)
 from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.reachability import Fault, Feasible, Postures
 from dro_grasp.arm.planning.task import PlanConfig
@@ -145,7 +154,7 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
         line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
         assert rehearsal.grip(line, postures, DEVIATIONS[0]) is not None
     rehearsal = Rehearsal(cell, few_contacts=12)
-    seen, scene = [], rehearsal.scene
+    seen, scene = [], rehearsal.scene(DEVIATIONS[0])
     honest = scene.advance
 
     def advance(*arguments: float, **options: float) -> None:
@@ -155,6 +164,39 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     scene.advance = advance
     rehearsal.grip(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
+
+
+@pytest.mark.parametrize("distance", [-0.01, 0.005])
+def test_what_was_not_seen_is_guessed_farther_as_far_as_the_table_leaves_room(
+    robot: dro.Robot, ball: dro.ObjectModel, distance: float
+) -> None:
+    seen = ball.cloud[ball.cloud_normals @ np.float32((0.6, 0.0, 0.8)) > 0]
+    assert robot.table is not None
+    height = robot.table.height
+    guess = replace(ball, seen=seen)
+    farther = guessed_farther(guess, distance, robot.table)
+    radius = np.linalg.norm(farther.cloud - (0.45, 0.0, RADIUS), axis=1)
+    away = np.linalg.norm(ball.cloud[:, None] - seen[None, ::7], axis=2).min(1)  # to some of them: never nearer than to all
+    hidden = (away > GUESSED_FROM + 0.005) & (farther.cloud[:, 2] > height + 1e-4)
+    shown = ball.cloud_normals @ np.float32((0.6, 0.0, 0.8)) > 0
+    assert hidden.sum() > 100 < shown.sum()
+    np.testing.assert_allclose(radius[hidden], RADIUS + distance, atol=1e-3)
+    np.testing.assert_allclose(radius[shown], RADIUS, atol=1e-3)
+    assert farther.cloud[:, 2].min() >= min(height, float(ball.cloud[:, 2].min())) - 1e-6
+    assert farther.sha256 != guess.sha256
+    assert SEEN_WITHIN < GUESSED_FROM
+
+
+def test_only_guesses_are_rehearsed_as_lying_farther(robot: dro.Robot, ball: dro.ObjectModel) -> None:
+    deviations = Deviation(), Deviation(weight=2.0), Deviation(unseen=0.01)
+    assert Rehearsal(Workcell(robot, (), ball), deviations).deviations == list(deviations[:2])
+    guess = replace(ball, seen=ball.cloud[ball.cloud_normals[:, 0] < 0])
+    rehearsal = Rehearsal(Workcell(robot, (), guess), deviations)
+    assert rehearsal.deviations == list(deviations)
+    usual, heavy, thick = map(rehearsal.scene, deviations)
+    assert usual is heavy
+    body = "object0-"
+    assert thick.model.body(body).mass[0] > 1.05 * usual.model.body(body).mass[0]
 
 
 def test_where_none_holds_the_best_score_is_taken_all_the_same(

@@ -16,13 +16,14 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 
 from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.reachability import Feasible, Postures
 from dro_grasp.arm.planning.workcell import ARM, TABLE, RobotJoints, Workcell, add_solids, moved, robot_spec, wxyz
-from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
@@ -48,6 +49,8 @@ STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
 """Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
 FALLEN = 0.02  # Depth from which on what was pushed fell off the table [m] (ours)
 TIPPING_SECONDS = 0.5  # What tips over an edge takes its time [s] (ours)
+SEEN_WITHIN = 0.004  # Distance from the next seen point up to which a point of an estimated object is known [m] (ours)
+GUESSED_FROM = 0.016  # The same from which it is a guess altogether (ours)
 FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
@@ -58,6 +61,7 @@ class Deviation:
     shift: tuple[float, float] = (0.0, 0.0)  # The object stands elsewhere on the table [m]
     friction: float = 1.0  # Factor of the friction
     weight: float = 1.0  # Factor of the object's weight
+    unseen: float = 0.0  # What a camera did not see of the object lies this much farther out than is guessed [m]
 
 
 DEVIATIONS = (Deviation(), Deviation((0.008, 0.0), 0.8, 1.3), Deviation((-0.004, 0.007), 0.8, 1.3),
@@ -113,7 +117,12 @@ class LiftScene:
         names = [self.model.actuator(i).name for i in range(self.model.nu)]
         self._arm_servos = np.array([names.index(ARM + n) for n in robot.arm_joints])
         self._hand_servos, self._driven = servo_joints(self.model, robot.hand)
+        self._gravity, self._friction = self.model.opt.gravity.copy(), self.model.geom_friction.copy()
         self.begin(robot.home, robot.open_hand)
+
+    def deviate(self, friction: float = 1.0, weight: float = 1.0) -> None:
+        """Multiply friction and weight of all that is there, from what they were at first."""
+        self.model.opt.gravity[:], self.model.geom_friction[:] = weight * self._gravity, friction * self._friction
 
     def begin(self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> None:
         """Start anew with the robot at rest in a configuration, and the objects far away."""
@@ -266,15 +275,23 @@ class Rehearsal:
 
         Up to `few_contacts` the solver against slip runs: its time grows with their square, and hands that hold have some 20.
         """
-        self.deviations, self.few_contacts = deviations, few_contacts
         obj, self.T_world_object = cell.target, cell.T_world_target
         assert obj is not None
         if obj.is_cloud and not np.array_equal(self.T_world_object, np.eye(4)):  # what stands on a table has its foot there
             obj, self.T_world_object = moved(obj, self.T_world_object), np.eye(4)
-        self.scene = LiftScene(cell, [obj], friction=friction)
-        self.scene.model.opt.timestep = 0.004  # [s] (ours)
-        self._gravity = self.scene.model.opt.gravity.copy()
-        self._friction = self.scene.model.geom_friction.copy()
+        first, *further = deviations  # where nothing is guessed, there is nothing farther out
+        self.deviations = [first, *(other for other in further if obj.seen is not None or not other.unseen)]
+        self.few_contacts = few_contacts
+        self._cell, self._obj, self._scenes, self._contact_friction = cell, obj, dict[float, LiftScene](), friction
+
+    def scene(self, deviation: Deviation) -> LiftScene:
+        """Where this takes place, as it was left."""
+        unseen = deviation.unseen if self._obj.seen is not None else 0.0
+        if unseen not in self._scenes:
+            obj = guessed_farther(self._obj, unseen, self._cell.robot.table) if unseen else self._obj
+            made = self._scenes[unseen] = LiftScene(self._cell, [obj], friction=self._contact_friction)
+            made.model.opt.timestep = 0.004  # [s] (ours)
+        return self._scenes[unseen]
 
     def rehearse(self, goal: Feasible, hand: Postures) -> Rehearsed:
         """All rehearsals of one grasp; one that drops the object where it is thought to be is the last."""
@@ -288,27 +305,27 @@ class Rehearsal:
 
         The hand closes as in trials; other numbers are ours.
         """
-        scene, start = self.scene, self._start(deviation)
+        scene, start = self._begin(deviation)
         approach = self._within(goal.approach[::-1], 0.03)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
-        self._follow(approach, hand.pregrasp[None], 0.3)
-        self._follow(approach[-1:], hand.closing, 1.0)
-        self._follow(approach[-1:], hand.squeeze[None], 0.3)
+        self._follow(scene, approach, hand.pregrasp[None], 0.3)
+        self._follow(scene, approach[-1:], hand.closing, 1.0)
+        self._follow(scene, approach[-1:], hand.squeeze[None], 0.3)
         if scene.touched(0) < FEWEST_LINKS:
             return None
         rows = self._within(goal.lift, 0.08)
-        self._follow(rows, hand.squeeze[None], 0.7)
+        self._follow(scene, rows, hand.squeeze[None], 0.7)
         risen, grip = scene.pose(0)[2, 3] - start[2, 3], scene.in_hand(0)
         if risen < self._lengths(rows)[-1] / 2:
             return None
-        self._follow(rows[-1:], hand.squeeze[None], 0.3)
+        self._follow(scene, rows[-1:], hand.squeeze[None], 0.3)
         slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
         return scene.in_hand(0) if slip < 0.02 and scene.touched(0) >= FEWEST_LINKS else None
 
     def push(self, arm: Trajectory, hand: Trajectory, rows: slice, deviation: Deviation) -> bool:
         """Whether the object stays on the table while the robot follows some rows of trajectories with the same times."""
-        scene, start = self.scene, self._start(deviation)
+        scene, start = self._begin(deviation)
         scene.model.opt.noslip_iterations = 0
         scene.begin(arm.position[rows.start], hand.position[rows.start])
         scene.place(0, start)
@@ -318,13 +335,12 @@ class Rehearsal:
         scene.advance(TIPPING_SECONDS)
         return bool(body.xpos[2] > height - FALLEN)
 
-    def _start(self, deviation: Deviation) -> Float[np.ndarray, "4 4"]:
-        """Where the object begins, once the scene deviates."""
-        model, start = self.scene.model, self.T_world_object.copy()
+    def _begin(self, deviation: Deviation) -> tuple[LiftScene, Float[np.ndarray, "4 4"]]:
+        """The scene that deviates so, and where the object begins in it."""
+        scene, start = self.scene(deviation), self.T_world_object.copy()
+        scene.deviate(deviation.friction, deviation.weight)
         start[:2, 3] += deviation.shift
-        model.opt.gravity[:] = deviation.weight * self._gravity
-        model.geom_friction[:] = deviation.friction * self._friction
-        return start
+        return scene, start
 
     def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:
         """The first configurations of a straight line, and one step of it at least."""
@@ -332,20 +348,40 @@ class Rehearsal:
 
     def _lengths(self, rows: Float[np.ndarray, "k n_arm"]) -> Float[np.ndarray, " k"]:
         """How far the wrist of each configuration is from that of the first [m]."""
-        places = self.scene.robot.T_world_wrist(rows)[:, :3, 3]
+        places = self._cell.robot.T_world_wrist(rows)[:, :3, 3]
         return np.linalg.norm(places - places[0], axis=1)
 
-    def _follow(self, arm: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, "m n_dof"], seconds: float) -> None:
+    def _follow(
+        self, scene: LiftScene, arm: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, "m n_dof"], seconds: float
+    ) -> None:
         """Let the servos follow waypoints, from rest to rest."""
         count = round(seconds / TICK)
         for i in range(1, count + 1):
             x = i / count
             along, rate = x * x * (3 - 2 * x), 6 * x * (1 - x) / seconds
             q, velocity = _at(arm, along)
-            self.scene.command(q, rate * velocity, _at(hand, along)[0])
-            few = self.scene.data.ncon <= self.few_contacts
-            self.scene.model.opt.noslip_iterations = LIFT_PROTOCOL.noslip if few else 0
-            self.scene.advance(TICK)
+            scene.command(q, rate * velocity, _at(hand, along)[0])
+            few = scene.data.ncon <= self.few_contacts
+            scene.model.opt.noslip_iterations = LIFT_PROTOCOL.noslip if few else 0
+            scene.advance(TICK)
+
+
+def guessed_farther(obj: ObjectModel, distance: float, table: Table | None) -> ObjectModel:
+    """A bare cloud, of which something was seen, whose guessed points lie farther out, as far as its table leaves room.
+
+    Args:
+        obj: The cloud, with normals out of it.
+        distance: How much farther; negative is farther in [m].
+        table: What it stands on, in the world, whose frame the cloud's is.
+    """
+    assert obj.seen is not None
+    away = KDTree(obj.seen).query(obj.cloud)[0]
+    share = np.clip((away - SEEN_WITHIN) / (GUESSED_FROM - SEEN_WITHIN), 0, 1)[:, None]
+    cloud = obj.cloud + distance * share * obj.cloud_normals
+    if table is not None:
+        cloud[:, 2] = np.maximum(cloud[:, 2], min(table.height, float(obj.cloud[:, 2].min())))
+    cloud = cloud.astype(np.float32)
+    return replace(obj, cloud=cloud, sha256=content_hash(cloud), balls=None)
 
 
 def _at(rows: Float[np.ndarray, "k n"], along: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
