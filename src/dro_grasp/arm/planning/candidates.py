@@ -37,11 +37,11 @@ def predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], Iterator
         middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
         directions = reachable_directions(task.robot, middle, task.seed)
     clouds = [thing.cloud for thing in task.cell.obstacles]
-    wanted = replace(
-        task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
+    obstacles = load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None
     config, hand, obj, T = task.config, task.robot.hand, task.obj, task.T
 
     def coming(batch: int) -> Iterator[GraspBatch]:
+        wanted = replace(task.wanted(batch), table=task.height, obstacles=obstacles)
         request = GraspRequest(
             config.num, task.seed_of(batch), config.candidates, source=config.source,
             least_confidence=task.least_confidence(batch))

@@ -23,7 +23,7 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, AdmissionConfig
 from dro_grasp.predict.config import AUTO
-from dro_grasp.predict.constraints import Constraints, lies_low
+from dro_grasp.predict.constraints import MAX_PREGRASP_CLEARANCE, Constraints, lies_low
 from dro_grasp.predict.finish import check_confidence
 from dro_grasp.predict.sources.source import Source
 
@@ -73,6 +73,9 @@ class PlanConfig(Checked):
     doubtful: float = 0.12
     """Probability of holding below which grasps are tried last, and only if they hold the object when rehearsed (ours): of
     those that do, half hold the true object of training scenes; of likelier ones nine in ten."""
+    guess_clearance: float = 0.015
+    """Distance that fingers keep in pregrasp from an object of which a side is a guess [m], in the first of several batches, and
+    where the constraints ask for none; 0 for none."""
     best_seconds: float = 1.0
     """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
@@ -100,6 +103,8 @@ class PlanConfig(Checked):
         check_friction(self.friction)
         if not self.deviations and self.rehearsals:
             raise OptionError("there are no deviations to rehearse lifts with; give one at least, or rehearsals=0")
+        if not 0 <= self.guess_clearance <= MAX_PREGRASP_CLEARANCE:
+            raise OptionError(f"guess_clearance is {self.guess_clearance}; give metres from 0 to {MAX_PREGRASP_CLEARANCE:g}")
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
@@ -195,6 +200,14 @@ class Task:
         if given is not None or self.rehearsal is None:
             return given
         return 0.0 if last and batch else self.config.doubtful
+
+    def wanted(self, batch: int) -> Constraints:
+        """What the grasps of this batch have to respect, apart from table and obstacles."""
+        own, room = self.constraints, self.config.guess_clearance
+        first, guessed = batch == 0 < self.config.batches - 1, self.obj.seen is not None
+        if first and guessed and room and own.pregrasp_clearance is None:
+            return replace(own, pregrasp_clearance=room)
+        return own
 
     def check_start(self) -> None:
         """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
