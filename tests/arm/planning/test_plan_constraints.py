@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -27,6 +27,7 @@ from dro_grasp.predict.predictor import Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
+from tests.helpers.clouds import cloud_of
 from tests.helpers.weights import untrained_weights
 
 SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
@@ -142,13 +143,14 @@ def test_what_says_nothing_or_says_it_twice_is_refused(
 
 
 class Listener(dro.GraspPredictor):
-    """Notes the least confidence of every request, and makes nothing."""
+    """Notes the least confidence of every request, and the room that it wants between fingers and object; makes nothing."""
 
     def __init__(self) -> None:
-        self.device, self.asked = "cpu", list[float | None]()
+        self.device, self.asked, self.room = "cpu", list[float | None](), list[float | None]()
 
     def run(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Prediction:
         self.asked.append(request.least_confidence)
+        self.room.append(problem.constraints.pregrasp_clearance)
         raise NoGraspError("nothing is made")
 
     def rounds(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Iterator[dro.GraspBatch]:
@@ -167,6 +169,28 @@ def test_every_batch_is_asked_for_with_the_least_confidence(
     with pytest.raises(dro.DroGraspError, match="nothing is made"):
         plan(robot, *standing, predictor=listener, config=config)
     assert listener.asked == [config.doubtful if least is None else least] * each + [least or 0.0] * each
+
+
+@pytest.mark.parametrize(("guessed", "config", "room"), [
+    (True, {}, [0.015, None, None]), (False, {}, [None] * 3), (True, {"batches": 1}, [None]),
+    (True, {"guess_clearance": 0.0}, [None] * 3), (True, {"guess_clearance": 0.02, "batches": 2}, [0.02, None]),
+    (True, {"constraints": dro.Constraints(pregrasp_clearance=0.007)}, [0.007] * 3)])
+def test_the_first_grasps_of_what_was_partly_guessed_leave_room_between_the_fingers(
+    robot: dro.Robot, guessed: bool, config: dict[str, Any], room: list[float | None]
+) -> None:
+    mesh = trimesh.creation.icosphere(4, 0.04)
+    mesh.apply_translation((0.45, 0.0, 0.04))
+    ball = cloud_of(mesh, "ball")
+    listener, obj = Listener(), replace(ball, seen=ball.cloud[ball.cloud_normals[:, 0] < 0]) if guessed else ball
+    with pytest.raises(dro.DroGraspError, match="nothing is made"):
+        plan(robot, obj, predictor=listener, config=dro.PlanConfig(num=2, **config))
+    assert listener.room == room
+
+
+@pytest.mark.parametrize("room", [-0.01, 0.3])
+def test_room_that_no_hand_leaves_is_refused(room: float) -> None:
+    with pytest.raises(OptionError, match=f"guess_clearance is {room}; give metres from 0 to 0.2"):
+        dro.PlanConfig(guess_clearance=room)
 
 
 def test_grasps_below_the_least_confidence_are_not_tried(
