@@ -159,8 +159,9 @@ def test_bare_cloud_is_not_tried(generate, tmp_path: Path) -> None:
 
 
 def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
-    objects, results = tmp_path / "objects", tmp_path / "results"
-    objects.mkdir(), results.mkdir()
+    """In a folder that is there, or is made."""
+    objects, results = tmp_path / "objects", tmp_path / "new" / "results"
+    objects.mkdir()
     trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
     trimesh.creation.icosphere(radius=0.03).export(objects / "a.ply")
     report = generate("--output", str(results), "--protocol", "none", name=str(objects))
@@ -236,8 +237,12 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
     (tmp_path / "a.stl").write_text("")
     (tmp_path / "b.stl").write_text("")
     base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
-    assert main([*base, "--output", str(tmp_path / "nowhere")]) == 2
-    assert "no folder" in capsys.readouterr().err
+    for option, name in (("--output", "all.parquet"), ("--picture", "all.png")):
+        assert main([*base, option, str(tmp_path / name)]) == 2
+        assert f"{name} is the name of a file; for 2 objects give that of a folder" in capsys.readouterr().err
+    assert main([*base, "--output", str(tmp_path / "a.stl")]) == 2
+    assert "a.stl" in capsys.readouterr().err
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.stl", "b.stl"]
 
 
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:

@@ -96,9 +96,9 @@ class Generate:
     only_successful: Flag = False
     """Save, draw and view only successful grasps. The success rate still counts all that were asked for."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
-    """Parquet file for the grasps. With a folder of objects: an existing folder, for one file an object."""
+    """Parquet file for the grasps. With a folder of objects: a folder, for one file an object."""
     picture: Annotated[Path | None, optional("PNG", "no picture")] = None
-    """Picture of the best grasps. With a folder of objects: an existing folder, for one picture an object."""
+    """Picture of the best grasps. With a folder of objects: a folder, for one picture an object."""
     view: Flag = False  # Open the viewer on the result.
     json: Flag = False  # Print one JSON object instead of a table.
     server: Annotated[str | None, optional("URL|none", "DRO_GRASP_SERVER, or none")] = None
@@ -366,15 +366,16 @@ class ObjectResult:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_output, command
+    from dro_grasp.files import check_output, make_folder
 
     if path is None:
         return [None] * len(names)
     if not several:
         return [check_output(path, suffix)]
-    if not path.is_dir():
-        raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one "
-                          f"({command('mkdir', '-p', path)})")
+    if path.suffix.lower() == suffix and not path.is_dir():
+        raise OutputError(f"{path} is the name of a file; for {len(names)} objects give that of a folder, such as "
+                          f"{path.with_suffix('')}")
+    path = make_folder(path)
     stems = [Path(name).stem for name in names]
     # mug.obj and mug.ply would overwrite each other's results.
     labels = [Path(n).name.replace(".", "_") if stems.count(s) > 1 else s for n, s in zip(names, stems, strict=True)]

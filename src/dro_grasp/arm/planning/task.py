@@ -74,8 +74,8 @@ class PlanConfig(Checked):
     """Probability of holding below which grasps are tried last, and only if they hold the object when rehearsed (ours): of
     those that do, half hold the true object of training scenes; of likelier ones nine in ten."""
     guess_clearance: float = 0.015
-    """Distance that fingers keep in pregrasp from an object of which a side is a guess [m], in the first of several batches, and
-    where the constraints ask for none; 0 for none."""
+    """Distance that fingers keep in pregrasp from an object of which a side is a guess [m]: in the first of several batches,
+    unless the constraints ask for another; 0 for none."""
     best_seconds: float = 1.0
     """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
