@@ -242,6 +242,9 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
         assert f"{name} is the name of a file; for 2 objects give that of a folder" in capsys.readouterr().err
     assert main([*base, "--output", str(tmp_path / "a.stl")]) == 2
     assert "a.stl" in capsys.readouterr().err
+    new = str(tmp_path / "new")
+    assert main([*base, "--output", new, "--picture", str(tmp_path / "all.png")]) == 2
+    assert main([*base, "--output", new, "--camera", str(tmp_path / "nowhere.json")]) == 2
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.stl", "b.stl"]
 
 

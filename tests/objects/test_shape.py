@@ -36,6 +36,19 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+def test_points_are_guesses_the_farther_they_are_from_what_was_seen() -> None:
+    cloud = cloud_of(trimesh.creation.icosphere(4, 0.04), "ball")
+    assert not cloud.guessed.any()
+    seen = cloud.cloud[cloud.cloud[:, 2] > 0]
+    guessed = replace(cloud, seen=seen).guessed
+    away = np.array([np.linalg.norm(seen - point, axis=1).min() for point in cloud.cloud])
+    assert (guessed[away <= 0.004] == 0).all()
+    assert (guessed[away >= 0.016] == 1).all()
+    between = (away > 0.004) & (away < 0.016)
+    assert between.sum() > 100
+    np.testing.assert_allclose(guessed[between], (away[between] - 0.004) / 0.012, atol=1e-4)
+
+
 def test_mass_properties_of_a_box():
     sides = np.array([0.04, 0.06, 0.08])
     box = trimesh.creation.box(sides, trimesh.transformations.translation_matrix((0.1, 0, -0.05)))

@@ -139,6 +139,7 @@ class Generate:
         """Names of the objects, where their files and pictures go, and what they share; libraries take seconds to load."""
         begin = time.perf_counter()
         load_libraries()
+        from dro_grasp.files import make_folder
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
@@ -167,6 +168,8 @@ class Generate:
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
+        for folder in {each.parent for each in (*outputs, *pictures) if each is not None}:
+            make_folder(folder)
         return names, outputs, pictures, Job(hand, predictor, request, constraints, camera, found, seconds)
 
     @property
@@ -366,7 +369,7 @@ class ObjectResult:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_output, make_folder
+    from dro_grasp.files import check_folder, check_output
 
     if path is None:
         return [None] * len(names)
@@ -375,8 +378,9 @@ def paths_per_object(path: Path | None, names: list[str], several: bool, suffix:
     if path.suffix.lower() == suffix and not path.is_dir():
         raise OutputError(f"{path} is the name of a file; for {len(names)} objects give that of a folder, such as "
                           f"{path.with_suffix('')}")
-    path = make_folder(path)
+    path = check_folder(path)
     stems = [Path(name).stem for name in names]
     # mug.obj and mug.ply would overwrite each other's results.
     labels = [Path(n).name.replace(".", "_") if stems.count(s) > 1 else s for n, s in zip(names, stems, strict=True)]
-    return [check_output(path / f"{label}{suffix}") for label in labels]
+    files = (path / f"{label}{suffix}" for label in labels)
+    return [check_output(file) if path.is_dir() else file for file in files]

@@ -8,6 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
@@ -26,6 +27,8 @@ BALL_SPACING = 0.008
 """Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
 MAX_BALLS = 2000  # Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred
 BALL_OUTSIDE = 0.0012  # How far a ball may reach through the surface elsewhere [m] (ours)
+SEEN_WITHIN = 0.004  # Distance from the next seen point up to which a point of an estimated object is known [m] (ours)
+GUESSED_FROM = 0.016  # The same from which it is a guess altogether (ours)
 ROUND = 1e-12  # Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)
 
 
@@ -81,6 +84,14 @@ class ObjectModel:
     def is_cloud(self) -> bool:
         """Whether this is a bare cloud, without a mesh."""
         return self.vertices is None
+
+    @cached_property
+    def guessed(self) -> Float[np.ndarray, " k"]:
+        """How much each point of the cloud is a guess, from 0 (known) to 1; 0 where `seen` is None."""
+        if self.seen is None:
+            return np.zeros(len(self.cloud))
+        away = KDTree(self.seen).query(self.cloud)[0]
+        return np.clip((away - SEEN_WITHIN) / (GUESSED_FROM - SEEN_WITHIN), 0, 1)
 
     @property
     def mass(self) -> float:

@@ -31,7 +31,7 @@ MAX_MARGIN = 10.0  # Largest margin that is accepted (ours)
 LOW = 0.035  # Height on a table up to which a thing is pinched from above, rather than clasped [m] (ours)
 MAX_BALLS = 1000  # Most balls of a contact region or keep-out (ours): each costs time at every step
 MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a contact region must contain (ours)
-Vector = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # What may be given for a `Direction`
+DirectionLike = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]
 BallRows = Sequence[Sequence[float]] | Real[np.ndarray, "n 4"] | Real[Tensor, "n 4"]  # What may be given for balls
 
 

@@ -26,7 +26,7 @@ from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
-from dro_grasp.predict.constraints import BallRows, Constraints, Vector
+from dro_grasp.predict.constraints import BallRows, Constraints, DirectionLike
 from dro_grasp.predict.finish import FinishConfig, Finished, complete_grasps, finish_all
 from dro_grasp.predict.problem import GraspProblem, problems_of
 from dro_grasp.predict.settling import can_settle
@@ -103,8 +103,8 @@ class GraspPredictor:
     @renamed(**FORMER_CONSTRAINTS)
     def predict(
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
-        direction: Vector | None = None, max_tilt: float | None = None, table: float | None = None,
-        obstacles: Scene | None = None, contact_region: BallRows = (), keep_out: BallRows = (),
+        direction: DirectionLike | None = None, max_tilt: float | None = None, table: float | None = None,
+        obstacles: Scene | None = None, contact_region: BallRows | None = None, keep_out: BallRows | None = None,
         pregrasp_clearance: float | None = None, touch_table: bool | None = None, margin: float | None = None,
         max_force: float | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
@@ -118,7 +118,7 @@ class GraspPredictor:
             num: Grasps to return.
             seed: The same seed gives the same grasps.
             constraints: What grasps have to respect, in the object's frame. The keywords from `direction` to
-                `max_force` replace its fields.
+                `max_force` replace its fields, where they are not None; no balls take those of its fields away.
             direction: Palm direction; (0, 0, -1) grasps from above.
             max_tilt: Largest angle between the palm direction and `direction` [rad].
             table: Height of a table [m]; the hand stays above it.
@@ -145,8 +145,7 @@ class GraspPredictor:
         given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
                  "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance,
                  "touch_table": touch_table, "margin": margin, "max_force": max_force}
-        asked = {name: x for name, x in given.items() if x is not None and not (isinstance(x, Sequence) and not x)}
-        wanted = replace(constraints or Constraints(), **asked)
+        wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None})
         problem = GraspProblem(hand, obj, self.device, wanted)
         if (warning := problem.constraints.warning(obj)) is not None:
             warnings.warn(warning, stacklevel=2)

@@ -166,6 +166,13 @@ def test_a_mesh_is_put_on_its_nearest_face_and_a_cloud_as_it_stood(tmp_path: Pat
     assert np.array_equal(standing_turn(cloud_object("cloud", cube.cloud, origin="cloud"), T), np.eye(3))
 
 
+@pytest.mark.parametrize("make", [tuple, list, np.array, torch.tensor])
+def test_a_place_is_any_kind_of_vector_or_a_surface_or_a_place(make: Any) -> None:
+    np.testing.assert_allclose(Place.of(make([0.5, 0.1, 0.0])).spot, (0.5, 0.1, 0.0), atol=1e-7)
+    turned = Place.of(make([0.5, 0.1, 0.0, 1.5]))
+    assert (turned.yaw, Place.of(turned), Place.of("box").surface) == (1.5, turned, "box")
+
+
 def places(robot: dro.Robot, standing: Standing, wanted: object, *obstacles: dro.ObjectModel) -> Places:
     obj, T = standing
     return Placing(Workcell(robot, obstacles, obj, T), Place.of(wanted)).places()  # type: ignore[arg-type]

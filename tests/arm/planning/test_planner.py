@@ -405,7 +405,8 @@ def test_a_plan_begins_where_the_arm_is(
     robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], grasped: dro.GraspBatch
 ) -> None:
     config = PlanConfig(rehearsals=0)
-    starts = [robot.home, robot.home + 0.3 * np.sign(robot.home.mean() - robot.home), [*robot.home[:-1], robot.home[-1] + 1.0]]
+    aside = torch.from_numpy(robot.home + 0.3 * np.sign(robot.home.mean() - robot.home))
+    starts = [robot.home, aside, [*robot.home[:-1], robot.home[-1] + 1.0]]
     for start in starts:
         made = plan(robot, *standing, config=config, grasps=grasped, start=start)
         np.testing.assert_allclose(made.arm.position[0], start, atol=1e-9)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -137,6 +140,19 @@ def test_without_a_choice_the_things_are_listed() -> None:
 def test_one_thing_needs_no_choice() -> None:
     found = load_scene(_table((0.2, 0.1))).object_at()
     np.testing.assert_allclose(found.obj.cloud[:, :2].mean(0), (0.2, 0.1), atol=0.005)
+
+
+@pytest.mark.parametrize("make", [list, np.array, np.float32, torch.tensor])
+def test_a_place_is_any_kind_of_vector(make: Callable[[Any], Any]) -> None:
+    found = load_scene(_table((0.2, 0.1), (-0.2, -0.1))).object_at(make((0.2, 0.1, 0.05)))
+    np.testing.assert_allclose(found.obj.cloud[:, :2].mean(0), (0.2, 0.1), atol=0.005)
+
+
+@pytest.mark.parametrize("make", [list, np.array, torch.tensor])
+def test_a_pixel_is_any_kind_of_vector(make: Callable[[Any], Any]) -> None:
+    made = make_scene("table", 1, 0, width=320)
+    row, column = (int(each[len(each) // 2]) for each in np.nonzero(made.owner == 0))
+    assert len(made.load().object_at(pixel=make((column, row))).obj.cloud) > 100
 
 
 def test_a_place_where_nothing_is_says_what_there_is() -> None:

@@ -20,7 +20,6 @@ from dro_grasp.pictures.scene import OBSTACLE_COLOUR, STRAY_COLOUR, STRUCTURE_CO
 
 CELL = 0.003  # Edge of the cubes of which one point each is drawn [m] (ours)
 MOST = 120_000  # Most points that are drawn (ours)
-GUESSED = 0.006  # Points farther than this from all that was seen are estimated [m] (ours)
 POINT = 0.0032  # Least size of a drawn point [m]
 LARGEST_POINT = 0.02  # Largest such size [m]
 GUESSED_COLOUR: Colour = (0.98, 0.78, 0.52)  # Pale orange of what was not seen, but is likely there
@@ -72,7 +71,7 @@ class SceneCloud:
                 own = rows[mine[rows]]
                 self._cloud("chosen/seen", self.world[own], np.tile(rgb(OBJECT_COLOUR), (len(own), 1)), self._shade[own])
             if obj is not None:
-                guess = np.ones(len(obj.cloud), bool) if obj.seen is None else KDTree(obj.seen).query(obj.cloud)[0] > GUESSED
+                guess = obj.guessed > 0
                 shade = shades(obj.cloud_normals[guess].astype(np.float64), np.asarray(self.up))
                 self._cloud("chosen/guessed", obj.cloud[guess], np.tile(rgb(GUESSED_COLOUR), (len(shade), 1)), shade)
             for k in range(self.scene.segments.count):

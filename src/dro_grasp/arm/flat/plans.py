@@ -16,11 +16,11 @@ from dro_grasp.arm.flat.grips import flat_grasps, overhangs
 from dro_grasp.arm.flat.sliding import AT_TABLE, SlideConfig, slide
 from dro_grasp.arm.flat.things import height_of, lies_flat, width_of
 from dro_grasp.arm.planning.motion import MotionPlan, grasps_and_dropped
-from dro_grasp.arm.planning.placing import Place
+from dro_grasp.arm.planning.placing import Place, PlaceLike
 from dro_grasp.arm.planning.planner import Tries, first_trusted, plan
 from dro_grasp.arm.planning.task import PlanConfig, Task, around
 from dro_grasp.arm.planning.workcell import moved
-from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.robots.robot import JointsLike, Robot
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
@@ -47,8 +47,8 @@ def may_slide(robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, 
 def plan_or_slide(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
-    seed: int = 0, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
-    place: Sequence[float] | str | Place | None = None,
+    seed: int = 0, start: JointsLike | None = None,
+    place: PlaceLike | None = None,
 ) -> MotionPlan:
     """As `plan`; but what lies flat is taken where it overhangs the table's edge, or pushed there if no grasp is trusted.
 
@@ -98,7 +98,7 @@ def plan_or_slide(
 
 def _ways(
     robot: Robot, obj: ObjectModel, obstacles: Sequence[ObjectModel], predictor: GraspPredictor | None, config: PlanConfig,
-    seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None, place: Sequence[float] | str | Place | None,
+    seed: int, start: JointsLike | None, place: PlaceLike | None,
     usual: Callable[[], MotionPlan],
 ) -> list[Callable[[], MotionPlan]]:
     """What is tried for a flat thing in the world, one after the other; each makes a motion, or says why it cannot."""
@@ -127,7 +127,7 @@ def _ways(
 
 def _trusted(
     robot: Robot, obj: ObjectModel, obstacles: Sequence[ObjectModel], predictor: GraspPredictor | None, config: PlanConfig,
-    seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None, place: Sequence[float] | str | Place | None,
+    seed: int, start: JointsLike | None, place: PlaceLike | None,
     grasps: GraspBatch | None = None,
 ) -> MotionPlan:
     """The motion to a grasp, of these or of the first predicted batch, that holds in most of its rehearsals.
@@ -135,7 +135,7 @@ def _trusted(
     Raises:
         PlanError: There is none.
     """
-    wanted = place if place is None or isinstance(place, Place) else Place.of(place)
+    wanted = None if place is None else Place.of(place)
     task = Task.of(robot, obj, np.eye(4), obstacles, replace(config, batches=1), seed, start, wanted)
     tries = Tries(grasps is None)
     task.check_start()

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial import ConvexHull
 
 from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.reachability import Feasible, Postures
@@ -49,8 +49,6 @@ STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
 """Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
 FALLEN = 0.02  # Depth from which on what was pushed fell off the table [m] (ours)
 TIPPING_SECONDS = 0.5  # What tips over an edge takes its time [s] (ours)
-SEEN_WITHIN = 0.004  # Distance from the next seen point up to which a point of an estimated object is known [m] (ours)
-GUESSED_FROM = 0.016  # The same from which it is a guess altogether (ours)
 FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
@@ -369,17 +367,14 @@ class Rehearsal:
 
 
 def guessed_farther(obj: ObjectModel, distance: float, table: Table | None) -> ObjectModel:
-    """A bare cloud, of which something was seen, whose guessed points lie farther out, as far as its table leaves room.
+    """A bare cloud whose guessed points lie farther out, as far as its table leaves room.
 
     Args:
         obj: The cloud, with normals out of it.
         distance: How much farther; negative is farther in [m].
         table: What it stands on, in the world, whose frame the cloud's is.
     """
-    assert obj.seen is not None
-    away = KDTree(obj.seen).query(obj.cloud)[0]
-    share = np.clip((away - SEEN_WITHIN) / (GUESSED_FROM - SEEN_WITHIN), 0, 1)[:, None]
-    cloud = obj.cloud + distance * share * obj.cloud_normals
+    cloud = obj.cloud + distance * obj.guessed[:, None] * obj.cloud_normals
     if table is not None:
         cloud[:, 2] = np.maximum(cloud[:, 2], min(table.height, float(obj.cloud[:, 2].min())))
     cloud = cloud.astype(np.float32)

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from dro_grasp.arm.planning.workcell import SINK, TABLE, VOXEL, Workcell
 from dro_grasp.arm.robots.robot import Table
@@ -43,12 +44,14 @@ class Place:
     falls: float = 0.0  # How far it may fall from the spot, as into a bin [m]
 
     @staticmethod
-    def of(given: Sequence[float] | str) -> Place:
+    def of(given: PlaceLike) -> Place:
         """From what a user gives.
 
         Raises:
             OptionError: It is neither the name of a surface nor three or four finite numbers.
         """
+        if isinstance(given, Place):
+            return given
         if isinstance(given, str):
             return Place(surface=given)
         try:
@@ -59,6 +62,9 @@ class Place:
             raise OptionError(f"place is {given}; give X Y Z of the object's foot in metres, and a turn about the vertical in "
                               "radians where one is wanted; or the name of a surface, such as 'table'")
         return Place((x, y, z), turn[0] if turn else None)
+
+
+PlaceLike = Place | Sequence[float] | Real[np.ndarray, " n"] | Real[Tensor, " n"] | str
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from dro_grasp.arm.planning.candidates import predicted
 from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
-from dro_grasp.arm.planning.placing import Place
+from dro_grasp.arm.planning.placing import Place, PlaceLike
 from dro_grasp.arm.planning.reachability import Fault, Feasible, Postures, carried
 from dro_grasp.arm.planning.task import PlanConfig, Task
 from dro_grasp.arm.planning.trajectory import find_path, timed_stages
 from dro_grasp.arm.planning.workcell import CARRIED
-from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.arm.robots.robot import JointsLike, Robot
 from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
@@ -46,8 +46,8 @@ def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
     seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
-    start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
-    place: Sequence[float] | str | Place | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
+    start: JointsLike | None = None,
+    place: PlaceLike | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
 ) -> MotionPlan:
     """A motion that grasps the object and lifts it, and puts it down where that is asked for.
 
@@ -77,7 +77,7 @@ def plan(
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
-    wanted = place if place is None or isinstance(place, Place) else Place.of(place)
+    wanted = None if place is None else Place.of(place)
     task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed, start, wanted, avoid)
     task.check_start()
     tries = Tries(grasps is None)

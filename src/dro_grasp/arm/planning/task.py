@@ -16,7 +16,7 @@ from dro_grasp.arm.planning.physics import DEVIATIONS, FRICTION, Deviation, Rehe
 from dro_grasp.arm.planning.placing import Place, Places, Placing, height_below
 from dro_grasp.arm.planning.reachability import Reachability, ReachConfig
 from dro_grasp.arm.planning.workcell import Workcell, moved, scene_solid, upright
-from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.robots.robot import JointsLike, Robot, Table
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
@@ -127,7 +127,7 @@ class Task:
     @staticmethod
     def of(
         robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
-        config: PlanConfig, seed: int, start: Sequence[float] | Float[np.ndarray, " n_arm"] | None = None,
+        config: PlanConfig, seed: int, start: JointsLike | None = None,
         place: Place | None = None, avoid: Sequence[Float[np.ndarray, "4 4"]] = (),
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""

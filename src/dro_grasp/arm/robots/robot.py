@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
+from torch import Tensor
 
 from dro_grasp.arm.robots.drivers import Drivers
 from dro_grasp.errors import OptionError
@@ -21,6 +22,7 @@ from dro_grasp.kinds import flat
 from dro_grasp.objects.perception.scene_files import SceneCamera
 
 TURN = np.pi  # Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)
+JointsLike = Sequence[float] | Real[np.ndarray, " n_arm"] | Real[Tensor, " n_arm"]
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class Robot:
         """The joints' limits, and at most TURN from home."""
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
 
-    def require_start(self, start: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n_arm"]:
+    def require_start(self, start: JointsLike) -> Float[np.ndarray, " n_arm"]:
         """Joints of the arm at which a motion may begin [rad or m]; OptionError: they are others, or out of range."""
         found, names = np.asarray(start, np.float64), ", ".join(self.arm_joints)
         if found.shape != self.home.shape:

@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.segmentation import NOTHING, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
-Spot = Sequence[float] | Float[np.ndarray, "3"]  # x, y, z [m]
-Pixel = Sequence[float] | Float[np.ndarray, "2"]  # Column and row, from the upper left
+Spot = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # x, y, z [m]
+Pixel = Sequence[float] | Real[np.ndarray, "2"] | Real[Tensor, "2"]  # Column and row, from the upper left
 ON = 0.01  # Way from a given place to a point of a thing up to which it lies on that thing [m] (ours)
 BESIDE = 0.05  # Longest way from a given place to the thing that is meant [m] (ours)
 ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
