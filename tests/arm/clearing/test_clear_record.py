@@ -49,6 +49,13 @@ def test_a_record_comes_back_whole(recorder: ClearRecorder, robot: dro.Robot, tm
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
+def test_a_record_keeps_a_point_of_each_cube_of_what_was_seen() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(4) * 0.003 + 0.001] * 3), -1).reshape(-1, 3)
+    made = ClearRecorder()
+    made.looked(np.concatenate([grid, grid + 0.0005, [[np.nan] * 3]]))
+    np.testing.assert_array_equal(np.sort(made.clouds[0], 0), np.sort(grid, 0))
+
+
 def test_what_is_no_record_is_refused(recorder: ClearRecorder, robot: dro.Robot, tmp_path: Path) -> None:
     path = tmp_path / "cleared.npz"
     recorder.record(robot).save(path)

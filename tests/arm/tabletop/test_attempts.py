@@ -21,14 +21,13 @@ from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.tabletop import experiment
 from dro_grasp.arm.tabletop.animation import Recorder, draw_animation
 from dro_grasp.arm.tabletop.attempts import Attempt
-from dro_grasp.arm.tabletop.camera_view import STRIDE, depth_image, thinned_intrinsics
+from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.experiment import PUSHES, TabletopConfig, attempt
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object
 from dro_grasp.arm.tabletop.table_setup import APART, other_objects, rest, scatter
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.perception.depth_noise import PRESETS, NoiseName
 from dro_grasp.objects.perception.scan import depth_points
-from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import solid_of
 
@@ -58,7 +57,8 @@ def test_the_robot_stays_at_home_and_an_object_comes_to_rest_on_the_table(scene:
 def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.Robot) -> None:
     assert robot.camera is not None
     (depth, _), T = depth_image(scene, robot.camera, 0.0, 0), robot.camera.T_world_camera
-    row, column = np.meshgrid(np.arange(depth.shape[0]) * STRIDE, np.arange(depth.shape[1]) * STRIDE, indexing="ij")
+    assert depth.shape == (robot.camera.height, robot.camera.width)
+    row, column = np.meshgrid(np.arange(depth.shape[0]), np.arange(depth.shape[1]), indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1)
     rays = pixels @ np.linalg.inv(robot.camera.intrinsics).T @ T[:3, :3].T
     expected = -T[2, 3] / rays[..., 2]
@@ -70,7 +70,7 @@ def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.R
 def _picked(depth: np.ndarray, robot: dro.Robot) -> tuple[PickedObject, np.ndarray]:
     """The only thing of a depth image, and its points in the camera's frame [m]."""
     assert robot.camera is not None
-    view = load_scene(depth, camera=SceneCamera(robot.camera.T_world_camera, thinned_intrinsics(robot.camera)))
+    view = load_scene(depth, camera=robot.camera.as_seen())
     assert view.sight is not None
     return pick_object(view, robot), view.sight.points[view.chosen().own]
 
@@ -95,7 +95,7 @@ def test_the_table_has_the_noise_of_a_kind_of_camera(scene: LiftScene, robot: dr
     assert camera is not None
     (true, mask), T = depth_image(scene, camera, 0.0, 0), camera.T_world_camera
     table = (true > 0) & ~mask
-    rays = depth_points(np.ones(true.shape), thinned_intrinsics(camera)).reshape(*true.shape, 3)
+    rays = depth_points(np.ones(true.shape), camera.intrinsics).reshape(*true.shape, 3)
     cosine = np.abs(rays @ T[2, :3]) / np.linalg.norm(rays, axis=-1)
     there, error = np.zeros(true.shape, int), []
     for seed in range(3):
@@ -118,14 +118,14 @@ def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: Lif
     T[:3, 2], T[:3, 0], T[:3, 3] = ahead / np.linalg.norm(ahead), (0, 1, 0), (1.3, 0.0, 0.7)
     T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
     depth, mask = depth_image(scene, replace(robot.camera, T_world_camera=T), 0.0, 0)
-    points = depth_points(depth, thinned_intrinsics(robot.camera)) @ T[:3, :3].T + T[:3, 3]
+    points = depth_points(depth, robot.camera.intrinsics) @ T[:3, :3].T + T[:3, 3]
     in_object = (points - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
     on = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs().numpy() < 2e-3
     assert (on | (np.abs(points[:, 2]) < 1e-3)).all()
     assert (on[mask[depth > 0]]).all()
     assert mask.sum() > 100
     covered = np.linalg.inv(T) @ robot.T_world_wrist(robot.home)[:, 3]
-    column, row = ((thinned_intrinsics(robot.camera) @ covered[:3])[:2] / covered[2]).round().astype(int)
+    column, row = ((robot.camera.intrinsics @ covered[:3])[:2] / covered[2]).round().astype(int)
     assert depth[row, column] == 0, "the hand is in view"
 
 

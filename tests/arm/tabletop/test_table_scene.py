@@ -11,10 +11,9 @@ import pytest
 import dro_grasp as dro
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import VOXEL, Workcell, moved, occupied
-from dro_grasp.arm.tabletop.camera_view import depth_image, thinned_intrinsics
+from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.table_scene import pick_object, seen_on_table
 from dro_grasp.cli.main import main
-from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import load_scene
 
 CUBE, BALL, RADIUS = (0.45, 0.1), (0.5, -0.1), 0.04
@@ -133,6 +132,5 @@ def test_an_empty_table_is_refused_in_words(robot: dro.Robot) -> None:
     scene.place(0, aside)
     assert robot.camera is not None
     depth = depth_image(scene, robot.camera, 0.0015, 0)[0]
-    camera = SceneCamera(robot.camera.T_world_camera, thinned_intrinsics(robot.camera))
     with pytest.raises(dro.DroGraspError, match="nothing stands out"):
-        pick_object(load_scene(depth, camera=camera), robot)
+        pick_object(load_scene(depth, camera=robot.camera.as_seen()), robot)

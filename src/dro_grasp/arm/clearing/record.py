@@ -16,11 +16,13 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.animation import Recorder
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.grasps.hold import HoldCheck, HoldState
 
 FORMAT = 1  # Version of files of such runs
 KIND = "cleared table"  # Entry `kind` of their header
 WANTED = "a record of a cleared table (.npz), as `dro-grasp clear --record` writes it"  # What a reader expects
+KEPT = 0.003  # Edge of the cubes of which one point each is kept [m] (ours)
 RATE = 10.0  # Moments that are kept for each second (ours)
 
 Shape = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]  # Vertices [m] and triangles
@@ -154,9 +156,10 @@ class ClearRecorder(Recorder):
     events: list[Event] = field(default_factory=list)
 
     def looked(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Keep what the camera sees, in its frame [m]."""
+        """Keep what the camera sees, in its frame, one point of each cube of KEPT [m]."""
         self.events.append(Look(self._moment, len(self.clouds)))
-        self.clouds.append(points)
+        points = points[np.isfinite(points).all(1)]
+        self.clouds.append(points[one_per_cell(points, KEPT)] if len(points) else points)
 
     def judged(self, check: HoldCheck, held: bool | None = None) -> None:
         """Keep what was made of the joints, and whether something was really held, where that is known."""

@@ -13,7 +13,7 @@ from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.physics import FRICTION, LiftScene, check_friction
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.arm.tabletop.camera_view import depth_image, thinned_intrinsics
+from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher
 from dro_grasp.arm.tabletop.table_setup import Region, scatter
 from dro_grasp.errors import OptionError, PlanError
@@ -79,7 +79,7 @@ class SimulatedRig:
         assert camera is not None
         self._looks += 1
         depth, _ = depth_image(self.scene, camera, self._noise, self._seed + self._looks)
-        points = depth_points(depth, thinned_intrinsics(camera))
+        points = depth_points(depth, camera.intrinsics)
         if self._watch is not None:
             self._watch.looked(points)
         return points

@@ -13,12 +13,6 @@ from dro_grasp.objects.perception.depth_noise import DepthView, depth_noise, mea
 from dro_grasp.simulation.scene import PREFIX
 
 REFLECTANCES = (0.1, 0.9)  # Shares of the light that things return, the table among them [1] (ours)
-STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
-
-
-def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:
-    """Those of the images that `depth_image` makes, whose pixels are STRIDE apart [pixels]."""
-    return camera.intrinsics / np.array([[STRIDE], [STRIDE], [1.0]])
 
 
 def depth_image(
@@ -29,7 +23,7 @@ def depth_image(
     Depth is zero where nothing is near, and where the robot's model covers the view. Objects are seen as their true meshes.
     `noise` is a preset of `depth_noise`, or the standard deviation of depth [m]. Things are dark or bright by chance.
     """
-    row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
+    row, column = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
     rays = np.linalg.solve(camera.intrinsics, pixels.T).T
     length = np.linalg.norm(rays, axis=1)
@@ -47,6 +41,6 @@ def depth_image(
     light = np.random.default_rng([seed, 1]).uniform(*REFLECTANCES, scene.model.ngeom)[geom]
     view = DepthView(
         np.where(seen, distance / length, 0.0).reshape(row.shape),
-        (normal.reshape(-1, 3) @ camera.T_world_camera[:3, :3]).reshape(*row.shape, 3), thinned_intrinsics(camera),
+        (normal.reshape(-1, 3) @ camera.T_world_camera[:3, :3]).reshape(*row.shape, 3), camera.intrinsics,
         light.reshape(row.shape))
     return measured_depth(view, depth_noise(noise), seed), first.reshape(row.shape)

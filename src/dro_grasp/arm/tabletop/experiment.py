@@ -24,7 +24,7 @@ from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.workcell import Workcell, moved
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.arm.tabletop.attempts import Attempt
-from dro_grasp.arm.tabletop.camera_view import depth_image, thinned_intrinsics
+from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.placed import draw_place, measured, place_fault
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object
 from dro_grasp.arm.tabletop.table_setup import Region, other_objects, scatter
@@ -38,7 +38,7 @@ from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 
-LABEL = "tabletop/12 "
+LABEL = "tabletop/13 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 16  # Most pushes of a flat thing towards an edge (ours)
@@ -276,7 +276,7 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     camera = robot.camera
     assert camera is not None
     depth, mask = depth_image(scene, camera, config.noise, seed)
-    view = load_scene(depth, obj.name, camera=replace(camera, intrinsics=thinned_intrinsics(camera)).as_seen())
+    view = load_scene(depth, obj.name, camera=camera.as_seen())
     if config.segment == "mask":
         seen = pick_object(view, robot, mask=mask)
     else:
