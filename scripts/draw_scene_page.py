@@ -19,7 +19,7 @@ from PIL import Image
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
-from dro_grasp.arm.tabletop.experiment import TabletopConfig, depth_image, scatter, thinned_intrinsics
+from dro_grasp.arm.tabletop.experiment import TabletopConfig, depth_image, scatter
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.browser import page_of
 
@@ -37,7 +37,7 @@ def write_scene(folder: Path) -> tuple[str, str]:
     depth, _ = depth_image(scene, robot.camera, "stereo", 5)
     Image.fromarray((1000 * np.nan_to_num(depth)).round().astype(np.uint16)).save(folder / "depth.png")
     camera = {"frame": "world", "T_frame_camera": robot.camera.T_world_camera.tolist(),
-              "intrinsics": thinned_intrinsics(robot.camera).tolist()}
+              "intrinsics": robot.camera.intrinsics.tolist()}
     (folder / "camera.json").write_text(json.dumps(camera))
     return str(folder / "depth.png"), str(folder / "camera.json")
 
