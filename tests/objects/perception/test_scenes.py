@@ -160,6 +160,12 @@ def test_a_place_where_nothing_is_says_what_there_is() -> None:
         load_scene(_table((0.2, 0.1))).object_at((-0.2, 0.2, 0.0))
 
 
+def test_level_tops_of_things_that_stand_apart_are_no_board() -> None:
+    corner = [(-0.15 + 0.08 * i, -0.15) for i in range(5)] + [(-0.15, -0.07 + 0.08 * i) for i in range(4)]
+    segments = load_scene(_table(*corner, spacing=0.003)).segments
+    assert (segments.count, len(segments.planes)) == (9, 1)
+
+
 def test_a_bare_table_shows_nothing() -> None:
     with pytest.raises(ObjectError, match=r"nothing stands out .*1 plane"):
         load_scene(_table()).object_at()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
 from dro_grasp.objects.perception.seams import Surface, joined, parted
@@ -31,6 +31,7 @@ SPANS = 0.5  # Share of the largest plane's length that a smaller one beside it 
 LEAST_WALL = 0.25  # Shortest diagonal of a wall [m] (ours)
 LEAST_BOARD = 0.4  # Shortest diagonal of a board along the largest plane [m] (ours)
 LEAST_BOARD_AREA = 0.03  # Least area of a board along the largest plane [m^2] (ours)
+FILLED = 0.65  # Share of its convex hull that such a board fills [1] (ours): the level tops of several things do not
 WALL_THICK = 0.016  # Half thickness of such a wall [m] (ours)
 LONGEST_FACE = 0.35  # Longest thing that is all one plane: what is longer is a wall seen from outside [m] (ours)
 FLOATS = 0.04  # Height above all planes from which a thing floats, so that it is a part of one below it [m] (ours)
@@ -168,6 +169,13 @@ class _Plane:
     def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         return points @ self.plane[:3] - self.plane[3]
 
+    @property
+    def filled(self) -> float:
+        """Share of the patch's convex hull that the patch fills."""
+        squares = np.argwhere(self.patch)
+        corners = np.concatenate([squares + corner for corner in ((0, 0), (0, 1), (1, 0), (1, 1))])
+        return len(squares) / float(ConvexHull(corners).volume)
+
     def beside(self, points: Float[np.ndarray, "n 3"], grown: int) -> Bool[np.ndarray, " n"]:
         """Points over or under the patch, grown by some squares."""
         patch = np.pad(self.patch, grown + 3)
@@ -268,7 +276,7 @@ def _is_structure(view: _View, plane: _Plane, found: list[_Plane]) -> bool:
     if longest < (LEAST_WALL if cosine < 0.2 else LEAST_BOARD):
         return False
     if cosine > 0.97:
-        return plane.area >= LEAST_BOARD_AREA
+        return plane.area >= LEAST_BOARD_AREA and plane.filled >= FILLED
     along = np.cross(plane.plane[:3], base.plane[:3])
     along = along / np.linalg.norm(along)
     low, high = np.quantile(points @ along, [0.02, 0.98])
