@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Never
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -162,40 +161,6 @@ def test_a_direction_must_point_somewhere(
 ) -> None:
     with pytest.raises(OptionError, match="has no direction"):
         predictor.predict(HAND, ball, num=1, direction=direction)
-
-
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Constraints]:
-    """Constraints of what is asked for; no grasps are made."""
-    asked = []
-
-    def listen(self: GraspPredictor, problem: GraspProblem, *arguments: object) -> Never:
-        asked.append(problem.constraints)
-        raise NoGraspError("nothing is made")
-
-    monkeypatch.setattr(GraspPredictor, "run", listen)
-    return asked
-
-
-@pytest.mark.parametrize("nothing", [(), [], np.zeros((0, 4)), torch.zeros(0, 4)])
-def test_keywords_replace_constraints_with_nothing_as_well(
-    predictor: GraspPredictor, ball: ObjectModel, asked: list[Constraints], nothing: Any
-) -> None:
-    own = Constraints(contact_region=((0.0, 0.0, 0.0, 0.5),), margin=1.0)
-    for given in ({}, {"contact_region": None}, {"contact_region": nothing}):
-        with pytest.raises(NoGraspError):
-            predictor.predict(HAND, ball, 1, constraints=own, **given)
-    assert asked == [own, own, Constraints(margin=1.0)]
-
-
-@pytest.mark.parametrize("make", [np.array, torch.tensor, list])
-def test_constraints_are_given_as_any_kind_of_rows(
-    predictor: GraspPredictor, ball: ObjectModel, make: Callable[[Any], Any], asked: list[Constraints]
-) -> None:
-    with pytest.raises(NoGraspError):
-        predictor.predict(
-            HAND, ball, 1, direction=make([0.0, 0.0, -1.0]), contact_region=make([[0.0, 0.0, 0.0, 0.5]]))
-    assert asked == [Constraints((0.0, 0.0, -1.0), contact_region=((0.0, 0.0, 0.0, 0.5),))]
 
 
 def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:
