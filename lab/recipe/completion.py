@@ -3,7 +3,7 @@
     python -m lab.recipe.completion --folder FOLDER [--output FILE] [--objects GROUP ...] [--steps N] [--workers N]
 
 Each object is viewed in its own and in stretched shapes, as half of a cloud, by a depth camera from many sides, and by one
-that sees it stand on a table. Cameras have no noise, that of each pixel alone, or that of a kind of camera. The network learns
+that sees it stand on a table, from which most are. Cameras have no noise, that of each pixel alone, or that of a kind of camera. The network learns
 the object's true signed distance near its surface, near the surfaces that symmetries guess, and around both. The folder keeps
 the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the network that is
 written is fitted to all. Assets are needed where objects are of them.
@@ -27,7 +27,7 @@ from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.network.completion_network import SHIPPED, SurfaceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import estimate_normals, mesh_object
-from dro_grasp.objects.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
+from dro_grasp.objects.perception.completion import CODED, GUESSES, THINNEST, surface_features, to_view_axes
 from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
 from dro_grasp.objects.perception.scan import without_outliers
@@ -41,10 +41,12 @@ KINDS: tuple[Kind, ...] = ("half", "depth", "table")
 """Kinds of view."""
 SHAPES = 5
 """Shapes of each object; the first is its own, the others are stretched."""
-SIDES = 3
+SIDES: dict[Kind, int] = {"half": 1, "depth": 3, "table": 5}
 """Views of each shape of each kind."""
 PLACES = 1536
 """Points with a true distance in a view."""
+KEPT = 384
+"""Points of the visible side that are kept of a view; each batch takes others of them."""
 STRETCH = (0.7, 1.35)
 """Range of the factors of a stretched object's extents."""
 BLUR = 0.006
@@ -55,7 +57,7 @@ AWAY = 0.006
 """Points at least this far from all seen points are unseen [m]."""
 DISTANCE = (0.35, 1.0)
 """Range of the cameras' distances [m]."""
-PIXEL = (0.002, 0.0036)
+PIXEL = (0.0012, 0.0036)
 """Range of the angle between pixels [rad]."""
 NOISE = (0.0, 0.0015)
 """Range of the noise of each pixel alone [m]."""
@@ -81,7 +83,7 @@ SOME = 384
 """Points of each of them."""
 RATE = 1e-3
 """Peak learning rate."""
-DECAY = 1e-4
+DECAY = 1e-2
 """Weight decay."""
 AVERAGE = 0.998
 """Decay of the moving average of the weights."""
@@ -102,6 +104,12 @@ class Views(NamedTuple):
     """Index into KINDS."""
     unseen: Bool[Tensor, "v n"]
     """Whether a point is away from all seen points."""
+    places: Float[Tensor, "v n 3"]
+    """The points in view axes [m]."""
+    seen: Float[Tensor, "v s 6"]
+    """Points of the visible side in view axes [m], and their normals."""
+    upright: Float[Tensor, " v"]
+    """1 where y is the image of the upward direction, otherwise 0."""
 
 
 def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
@@ -156,17 +164,15 @@ def seen_of(obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.ra
     return Seen(points, normals, place, up if known else None, table)
 
 
-def view_of(
-    obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.random.Generator
-) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
-    """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
+def view_of(obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.random.Generator) -> Views | None:
+    """One view, without a dimension of views; None if too little is seen."""
     seen = seen_of(obj, kind, up, rng)
     if seen is None or len(seen.points) < FEWEST:
         return None
-    side, axes, middle = to_view_axes(seen.points, seen.normals, seen.camera, seen.table)
+    side, axes, middle = to_view_axes(seen.points, seen.normals, seen.camera, seen.table, seen.up)
     if side.width < THINNEST:
         return None
-    guesses = side.guesses(None if seen.up is None else seen.up @ axes, GUESSES)
+    guesses = side.guesses(GUESSES)
     true = (obj.cloud - middle) @ axes
     guessed = np.concatenate([g.points for g in guesses])
     both, n = np.concatenate([true, guesses[0].points]), PLACES // 3
@@ -177,7 +183,10 @@ def view_of(
     assert obj.faces is not None
     truth = signed_distances(obj.vertices, obj.faces, places @ axes.T + middle)
     unseen = side.tree.query(places)[0] > AWAY
-    return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
+    kept = rng.choice(len(side.points), KEPT, replace=len(side.points) < KEPT)
+    visible = np.concatenate([side.points[kept], side.normals[kept]], 1)
+    return Views(told.guessed, told.features, torch.from_numpy(truth).float(), torch.tensor(KINDS.index(kind)),
+                 torch.from_numpy(unseen), told.places, torch.from_numpy(visible).float(), told.upright)
 
 
 def resting(obj: ObjectModel, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
@@ -190,20 +199,17 @@ def resting(obj: ObjectModel, rng: np.random.Generator) -> Float[np.ndarray, "3"
 def collect(shapes: int, given: tuple[str, int]) -> tuple[tuple[Tensor, ...], str]:
     """Views of the object of this name, seen with this seed, and of its stretched shapes, and what to print of them."""
     label, seed = given
-    rng, own, found, kinds = np.random.default_rng(seed), load_object(label), [], []
+    rng, own, found = np.random.default_rng(seed), load_object(label), []
     for shape in range(shapes):
         try:
             obj = own if shape == 0 else stretched(own, rng)
         except ObjectError as error:
             print(f"{label}: {error}")
             continue
-        for k, kind in enumerate(KINDS):
-            ups = [resting(obj, rng) if rng.uniform() < RESTING else np.eye(3)[2] for _ in range(SIDES)]
-            views = [view for view in (view_of(obj, kind, up, rng) for up in ups) if view is not None]
-            found += views
-            kinds += [k] * len(views)
-    guessed, features, truth, unseen = (torch.stack(column) for column in zip(*found, strict=True))
-    return tuple(Views(guessed, features, truth, torch.tensor(kinds), unseen)), f"{len(kinds)} views"
+        for kind, sides in SIDES.items():
+            ups = [resting(obj, rng) if rng.uniform() < RESTING else np.eye(3)[2] for _ in range(sides)]
+            found += [view for view in (view_of(obj, kind, up, rng) for up in ups) if view is not None]
+    return tuple(torch.stack(column) for column in zip(*found, strict=True)), f"{len(found)} views"
 
 
 def joined(parts: list[Views]) -> Views:
@@ -227,7 +233,13 @@ def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
     for _ in range(steps):
         view = torch.randint(len(views.truth), (VIEWS, 1), generator=generator)
         place = torch.randint(views.truth.shape[1], (VIEWS, SOME), generator=generator)
-        loss = error(network(views.guessed[view, place], views.features[view, place]), views.truth[view, place]).mean()
+        point = torch.randint(views.seen.shape[1], (VIEWS, CODED), generator=generator)
+        # Half of the views are mirrored, left to right: other features stay the same.
+        side = torch.ones(VIEWS, 1, 6)
+        side[torch.rand(VIEWS, generator=generator) < 0.5] = torch.tensor([-1.0, 1, 1, -1, 1, 1])
+        predicted = network(views.guessed[view, place], views.features[view, place], views.places[view, place] * side[..., :3],
+                            views.seen[view, point] * side, views.upright[view[:, 0]])
+        loss = error(predicted, views.truth[view, place]).mean()
         optimiser.zero_grad()
         (1e3 * loss).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -246,7 +258,8 @@ def errors(network: SurfaceNetwork, views: Views) -> dict[str, dict[str, float]]
         some = Views(*(column[views.kind == k] for column in views))
         if not len(some.kind):
             continue
-        predicted = torch.cat([network(g, f) for g, f in zip(some.guessed.split(16), some.features.split(16), strict=True)])
+        parts = (Views(*part) for part in zip(*(column.split(16) for column in some), strict=True))
+        predicted = torch.cat([network(v.guessed, v.features, v.places, v.seen, v.upright) for v in parts])
         for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):
             near = some.unseen & (some.truth.abs() < 0.01)
             found[f"{kind}, {name}"] = {
@@ -263,11 +276,11 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["assets:train", "builtin:train"], help="training objects")
     parser.add_argument("--shapes", type=int, default=SHAPES, help="shapes of each object; all but one are stretched")
     parser.add_argument("--steps", type=int, default=2500, help="steps of each of the two fits")
-    parser.add_argument("--workers", type=int, default=1, help="processes that collect")
+    parser.add_argument("--workers", type=int, default=1, help="processes that collect, then threads of a fit")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    torch.set_num_threads(options.workers)
     options.folder.mkdir(parents=True, exist_ok=True)
     labels = resolve_objects(options.objects)
     tasks = [(options.folder / f"{label.replace('/', '-')}-{options.seed}.pt", (label, options.seed * len(labels) + k))

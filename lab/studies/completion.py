@@ -51,7 +51,7 @@ def likeliest(
 ) -> Float[np.ndarray, "k 3"]:
     """The other side by the best symmetry alone."""
     side, axes, middle = to_view_axes(points, normals, camera)
-    return side.guesses(None, 1)[0].points[len(side.points):] @ axes.T + middle
+    return side.guesses(1)[0].points[len(side.points):] @ axes.T + middle
 
 
 def errors(

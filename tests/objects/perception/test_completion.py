@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import igl
@@ -15,9 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.perception.completion import GUESSES, Guess, VisibleSide, complete_cloud, surface_features, to_view_axes
+from dro_grasp.objects.perception.completion import GUESSES, SurfaceFeatures, complete_cloud, surface_features, to_view_axes
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
 
+FEATURES = 23  # Features of a place
 Shape = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
@@ -81,8 +81,8 @@ def likeliest(
     points: np.ndarray, normals: np.ndarray, camera: np.ndarray | None, up: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the best symmetry alone adds, and its normals."""
-    side, axes, middle = to_view_axes(points, normals, camera)
-    guess = side.guesses(None if up is None else up @ axes, 1)[0]
+    side, axes, middle = to_view_axes(points, normals, camera, up=up)
+    guess = side.guesses(1)[0]
     n = len(side.points)
     np.testing.assert_array_equal(guess.points[:n], side.points)
     return guess.points[n:] @ axes.T + middle, guess.normals[n:] @ axes.T
@@ -142,7 +142,7 @@ def test_where_the_network_finds_no_surface_the_best_guess_stays() -> None:
     points, normals, _ = box()
     camera = np.array([0.36, 0.29, 0.38])
     shown = facing(points, normals, camera)
-    network = SurfaceNetwork(GUESSES, shipped_surface().enter.in_features)
+    network = SurfaceNetwork(GUESSES, FEATURES)
     with torch.no_grad():
         # Everything is a metre away.
         network.leave.bias[GUESSES] = 100.0
@@ -157,8 +157,7 @@ def test_an_untrained_network_believes_the_best_symmetry() -> None:
     camera = np.array([0.36, 0.29, 0.38])
     shown = facing(points, normals, camera)
     added, _ = likeliest(points[shown], normals[shown], camera)
-    sides = surface_features(*_told(points[shown], normals[shown], camera), np.zeros((1, 3)))
-    network = SurfaceNetwork(GUESSES, sides.features.shape[1])
+    network = SurfaceNetwork(GUESSES, FEATURES)
     with torch.no_grad():
         # Sure of the first guess instead of only rather so.
         network.leave.bias[0] = 50.0
@@ -169,23 +168,67 @@ def test_an_untrained_network_believes_the_best_symmetry() -> None:
     assert np.quantile(KDTree(whole.points).query(added)[0], 0.95) < 0.005
 
 
-def _told(points: np.ndarray, normals: np.ndarray, camera: np.ndarray) -> tuple[VisibleSide, list[Guess]]:
-    side, _, _ = to_view_axes(points, normals, camera)
-    return side, side.guesses(None, GUESSES)
+def _told(
+    points: np.ndarray, normals: np.ndarray, camera: np.ndarray, up: np.ndarray | None, places: np.ndarray
+) -> SurfaceFeatures:
+    side, axes, middle = to_view_axes(points, normals, camera, up=up)
+    return surface_features(side, side.guesses(GUESSES), (places - middle) @ axes)
 
 
-def test_what_the_network_is_told_does_not_change_with_turns_about_the_view() -> None:
-    points, normals, _ = cylinder()
-    camera = np.array([0.0, 0.36, 0.48])
+@pytest.mark.parametrize("up", [None, np.array([0.0, 0.6, 0.8])], ids=["no up", "up"])
+def test_what_the_network_is_told_does_not_change_with_the_frame(up: np.ndarray | None) -> None:
+    """Of a view that is turned as a whole, with its camera."""
+    points, normals, _ = box()
+    camera = np.array([0.2, 0.3, 0.48])
     shown = facing(points, normals, camera)
-    side, guesses = _told(points[shown], normals[shown], camera)
     places = np.random.default_rng(1).uniform(-0.06, 0.06, (200, 3))
-    turn = Rotation.from_euler("z", 0.7).as_matrix()
-    turned = dataclasses.replace(side, points=side.points @ turn.T, normals=side.normals @ turn.T)
-    turned_guesses = [Guess(g.points @ turn.T, g.normals @ turn.T, g.cost) for g in guesses]
-    for told, again in zip(surface_features(side, guesses, places),
-                           surface_features(turned, turned_guesses, places @ turn.T), strict=True):
-        torch.testing.assert_close(told, again, atol=1e-4, rtol=1e-4)
+    turn, moved = Rotation.from_euler("xyz", (0.7, -2.0, 1.1)).as_matrix(), np.array([0.3, -0.2, 0.5])
+    told = _told(points[shown], normals[shown], camera, up, places)
+    again = _told(points[shown] @ turn.T + moved, normals[shown] @ turn.T, turn @ camera + moved,
+                  None if up is None else turn @ up, places @ turn.T + moved)
+    for one, other in zip(told, again, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+    assert told.upright == (up is not None)
+
+
+@pytest.mark.parametrize("up", [np.array([0.0, 0.0, 1.0]), np.array([0.6, -0.64, 0.48])])
+def test_up_is_up_in_the_image(up: np.ndarray) -> None:
+    points, normals, _ = cylinder()
+    camera = np.array([0.2, 0.36, 0.3])
+    shown = facing(points, normals, camera)
+    side, axes, middle = to_view_axes(points[shown], normals[shown], camera, up=up)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    np.testing.assert_allclose(axes[:, 2], (camera - middle) / np.linalg.norm(camera - middle), atol=1e-12)
+    assert side.up is not None
+    np.testing.assert_allclose(side.up[0], 0, atol=1e-12)
+    assert side.up[1] > 0
+
+
+def test_a_camera_straight_above_knows_no_up_in_its_image() -> None:
+    """The image is then longest along x, as without an upward direction."""
+    points, normals, _ = box()
+    up = np.array([0.0, 0.0, 1.0])
+    shown = facing(points, normals, 0.5 * up)
+    seen, camera = points[shown], np.append(points[shown].mean(0)[:2], 0.5)
+    side, axes, _ = to_view_axes(seen, normals[shown], camera, up=up)
+    assert not side.upright
+    np.testing.assert_allclose(np.abs(axes[1, 0]), 1, atol=0.01)
+    np.testing.assert_allclose(axes, to_view_axes(seen, normals[shown], camera)[1])
+
+
+def test_the_network_sees_the_whole_side_and_no_order_of_its_points() -> None:
+    torch.manual_seed(0)
+    network = shipped_surface()
+    guessed, features, places = 0.01 * torch.randn(2, 7, GUESSES), torch.randn(2, 7, FEATURES), 0.03 * torch.randn(2, 7, 3)
+    normals = torch.nn.functional.normalize(torch.randn(2, 60, 3), dim=-1)
+    seen, upright = torch.cat([0.03 * torch.randn(2, 60, 3), normals], -1), torch.tensor([0.0, 1.0])
+    both = network(guessed, features, places, seen, upright)
+    order = torch.randperm(60)
+    torch.testing.assert_close(network(guessed, features, places, seen[:, order], upright), both)
+    for k in range(2):
+        torch.testing.assert_close(network(guessed[k], features[k], places[k], seen[k], upright[k]), both[k])
+    assert (network(guessed, features, places, seen.flip(0), upright) - both).abs().min() > 1e-6
 
 
 def test_the_network_is_nearer_to_unseen_surfaces_than_symmetry() -> None:
@@ -206,7 +249,8 @@ def test_the_network_that_ships_is_one_of_these_features() -> None:
     assert network.guesses == GUESSES
     assert not network.training
     with torch.no_grad():
-        far = network(torch.full((1, GUESSES), 0.05), torch.zeros(1, network.enter.in_features))
+        far = network(torch.full((1, GUESSES), 0.05), torch.zeros(1, FEATURES), torch.zeros(1, 3), torch.zeros(1, 6),
+                      torch.tensor(0.0))
     assert torch.isfinite(far).all()
 
 
@@ -245,7 +289,7 @@ def test_nothing_is_thought_below_a_table() -> None:
     height = places[:, 2] - 0.02
     local = (places - middle) @ axes
     np.testing.assert_allclose(local @ side.table[:3] - side.table[3], height, atol=1e-12)
-    guesses = bare.guesses(None, GUESSES)
+    guesses = bare.guesses(GUESSES)
     told, untold = (surface_features(one, guesses, local).features.double().numpy() for one in (side, bare))
     changed = np.flatnonzero(np.abs(told - untold).max(0) > 0)
     np.testing.assert_allclose(told[:, changed[0]], np.arcsinh(height / 0.01) / 2, atol=1e-6)

@@ -70,11 +70,12 @@ class VisibleSide:
     top: float  # height above which nothing is visible [m]
     pitch: float = 0.0  # distance of neighbouring pixels at the object; 0 without a camera [m]
     table: Float[np.ndarray, "4"] | None = None  # plane on which the object stands: upward normal, and height along it [m]
+    up: Float[np.ndarray, "3"] | None = None  # upward direction, if it is known
 
     @classmethod
     def of(
         cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera_distance: float | None,
-        pitch: float = 0.0, table: Float[np.ndarray, "4"] | None = None,
+        pitch: float = 0.0, table: Float[np.ndarray, "4"] | None = None, up: Float[np.ndarray, "3"] | None = None,
     ) -> VisibleSide:
         """Find the rim, and predict how the surface continues there."""
         # In an image, a point belongs to the rim if its neighbours lie to one side of it. A cloud cut by a plane has its rim
@@ -102,11 +103,16 @@ class VisibleSide:
         # In an image normals are less certain than at a cut (ours).
         smooth = 0.5 * (1 - facing) if camera_distance is None else 0.1 * np.clip(1 - facing / TURNS_AWAY, 0, 1)
         return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top),
-                   pitch, table)
+                   pitch, table, up)
 
-    def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
-        """Both sides by the best symmetries that differ, best first; those that preserve `up` [view axes] are preferred."""
-        motions = self.symmetries(up)
+    @property
+    def upright(self) -> bool:
+        """Whether the upward direction is known, and lies along y in the image."""
+        return self.up is not None and abs(self.up[2]) < STRAIGHT_DOWN
+
+    def guesses(self, count: int) -> list[Guess]:
+        """Both sides by the best symmetries that differ, best first; those that preserve the upward direction are preferred."""
+        motions, up = self.symmetries(), self.up
         leaning = [up is not None and not np.allclose(linear @ up, up, atol=1e-6) for linear, _ in motions]
         costs = np.array([self.cost(*motion) for motion in motions]) + 0.1 * np.array(leaning)  # (ours)
         found: list[Guess] = []
@@ -124,14 +130,12 @@ class VisibleSide:
                 break
         return found + found[-1:] * (count - len(found))
 
-    def symmetries(self, up: Float[np.ndarray, "3"] | None) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
+    def symmetries(self) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
         """Linear parts M and fixed points c of the candidate motions."""
-        across = self.points[:, :2]
-        axes = np.linalg.eigh(np.cov(across.T))[1]
-        if up is not None and abs(up[2]) < STRAIGHT_DOWN:
-            # An object that stands is symmetric about its middle along the horizon. Without a vertical, the principal axes
-            # of the image are the best guess.
-            axes = np.array([[up[1], up[0]], [-up[0], up[1]]]) / np.hypot(up[0], up[1])
+        across, up = self.points[:, :2], self.up
+        # An object that stands is symmetric about its middle along the horizon. Without a vertical, the principal axes of the
+        # image are the best guess.
+        axes = np.eye(2) if self.upright else np.linalg.eigh(np.cov(across.T))[1]
         along = across @ axes
         middle = axes @ (along.max(0) + along.min(0)) / 2
         turns = np.arange(TURNS) * 2 * np.pi / TURNS
@@ -141,7 +145,7 @@ class VisibleSide:
         if up is not None:
             # The half turn about the vertical, and mirrors in vertical planes, are not among the motions in image axes.
             half_turns.append(up)
-            ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up if abs(up[2]) < STRAIGHT_DOWN else np.cross(up, [1.0, 0.0, 0.0])
+            ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up if self.upright else np.cross(up, [1.0, 0.0, 0.0])
             ahead /= np.linalg.norm(ahead)
             mirrors += [np.cos(a) * ahead + np.sin(a) * np.cross(up, ahead) for t in (0.0, *TILTS) for a in {t, -t}]
         linear = [-np.eye(3), *(2 * np.outer(a, a) - np.eye(3) for a in half_turns),
@@ -189,6 +193,7 @@ class VisibleSide:
 
 GUESSES = 5  # Symmetries that the network chooses between (ours)
 VISIBLE_POINTS = 2048  # Most visible points that guesses are made of (ours)
+CODED = 256  # Most visible points that the network sees (ours)
 THINNEST = 1e-4  # Width in the image below which nothing can be said of the other side [m] (ours)
 CELLS = 20_000  # Approximate number of grid cells for the surface (ours): edges of 5 mm for a large can, 1 mm for a die
 MARGIN = 0.01  # Distance that the grid extends beyond all guesses [m] (ours)
@@ -214,6 +219,9 @@ class SurfaceFeatures(NamedTuple):
     plane, distance from the image, height over the surface there, heights above the end and the top of the visible side, height
     above the table, distance of neighbouring pixels. Then: position along the view and across it, the cost of each guess, the
     visible width, and whether there is a camera, and a table."""
+    places: Float[Tensor, "n 3"]  # in view axes [m]
+    seen: Float[Tensor, "m 6"]  # points of the visible side in view axes [m], and their normals
+    upright: Float[Tensor, ""]  # 1 if y is the image of the upward direction, otherwise 0
 
 
 def complete_cloud(
@@ -228,10 +236,10 @@ def complete_cloud(
     Symmetries that preserve the `up` direction, if it is known, are preferred. What stands on the plane of a `table`, its
     upward normal and its height along it [m], reaches down to it. The shipped network chooses between symmetries by default.
     """
-    side, axes, middle = to_view_axes(points, normals, camera, table)
+    side, axes, middle = to_view_axes(points, normals, camera, table, up)
     if side.width < THINNEST:
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
-    guesses = side.guesses(None if up is None else up @ axes, GUESSES)
+    guesses = side.guesses(GUESSES)
     surface, outward = extract_surface(side, guesses, network or shipped_surface())
     # One visible point is kept per cube of a fortieth of the width, but not below 2 mm or a tenth of the width (ours).
     apart = max(side.width / 40, min(0.002, side.width / 10))
@@ -257,9 +265,12 @@ def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"]) -> CompletedClou
 
 def to_view_axes(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None,
-    table: Float[np.ndarray, "4"] | None = None,
+    table: Float[np.ndarray, "4"] | None = None, up: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[VisibleSide, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """The visible side in view axes, with z to the camera; these axes as columns; and their origin, the middle [m]."""
+    """The visible side in view axes; these axes as columns; and their origin, the middle [m].
+
+    z points to the camera. The image of the `up` direction lies along y; if that is not known, the image is longest along x.
+    """
     pitch = 0.0 if camera is None else _pitch(points, camera)
     if len(points) > VISIBLE_POINTS:
         kept = np.random.default_rng(0).permutation(len(points))[:VISIBLE_POINTS]
@@ -268,13 +279,30 @@ def to_view_axes(
     view = normals.mean(0) if camera is None else camera - middle
     length = float(np.linalg.norm(view))
     view = view / max(length, 1e-9)
-    helper = np.eye(3)[np.abs(view).argmin()]
-    across = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
-    axes = np.stack([across, np.cross(view, across), view], 1)
+    axes = _axes(points - middle, view, up)
     if table is not None:
         table = np.append(table[:3] @ axes, table[3] - table[:3] @ middle)
     distance = None if camera is None else length
-    return VisibleSide.of((points - middle) @ axes, normals @ axes, distance, pitch, table), axes, middle
+    known = None if up is None else up @ axes
+    return VisibleSide.of((points - middle) @ axes, normals @ axes, distance, pitch, table, known), axes, middle
+
+
+def _axes(
+    points: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "3 3"]:
+    """Axes as columns, the view last."""
+    if up is not None and abs(view @ up) < STRAIGHT_DOWN:
+        across = np.cross(up, view)
+    else:
+        helper = np.eye(3)[np.abs(view).argmin()]
+        first = np.cross(view, helper)
+        image = np.stack([first, np.cross(view, first)], 1) / np.linalg.norm(first)
+        flat = points @ image
+        longest = np.linalg.eigh(flat.T @ flat)[1][:, 1]
+        # The direction in which the points reach farther from their middle.
+        across = image @ longest * np.sign(((flat @ longest) ** 3).sum() or 1.0)
+    across = across / np.linalg.norm(across)
+    return np.stack([across, np.cross(view, across), view], 1)
 
 
 def _pitch(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> float:
@@ -288,7 +316,7 @@ def _pitch(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> 
 
 
 def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.ndarray, "n 3"]) -> SurfaceFeatures:
-    """Input of the network at places in view axes [m]; it does not depend on rotations about the view."""
+    """Input of the network at places in view axes [m]."""
     guessed = np.stack([cloud_distances(g.points, g.normals, places) for g in guesses], 1)
     distance, nearest = side.tree.query(places)
     over = ((places - side.points[nearest]) * side.normals[nearest]).sum(1)
@@ -303,7 +331,10 @@ def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.n
     whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, *known])
     features = np.column_stack([
         np.arcsinh(metres / SMALL) / 2, height / LENGTH, across / LENGTH, np.broadcast_to(whole, (len(places), len(whole)))])
-    return SurfaceFeatures(torch.from_numpy(guessed).float(), torch.from_numpy(features).float())
+    some = side.sample[:CODED]
+    seen = np.concatenate([side.points[some], side.normals[some]], 1)
+    g, f, p, s = (torch.from_numpy(column).float() for column in (guessed, features, places, seen))
+    return SurfaceFeatures(g, f, p, s, torch.tensor(float(side.upright)))
 
 
 @torch.no_grad()
