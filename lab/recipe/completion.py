@@ -2,11 +2,11 @@
 
     python -m lab.recipe.completion --folder FOLDER [--output FILE] [--objects GROUP ...] [--steps N] [--workers N]
 
-Each object is viewed in its own and in stretched shapes, as half of a cloud, by a depth camera from many sides, and by one
-that sees it stand on a table, from which most are. Cameras have no noise, that of each pixel alone, or that of a kind of camera. The network learns
-the object's true signed distance near its surface, near the surfaces that symmetries guess, and around both. The folder keeps
-the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the network that is
-written is fitted to all. Assets are needed where objects are of them.
+Each object is viewed in its own and in stretched shapes, as half of a cloud, by a depth camera from many sides, and most often
+by one that sees it stand on a table. Cameras have no noise, that of each pixel alone, or that of a kind of camera. The network
+learns the object's true signed distance near its surface, near the surfaces that symmetries guess, and around both. The folder
+keeps the views of each object, so a stopped script resumes. It reports errors on objects left out of a first fit; the network
+that is written is fitted to all. Assets are needed where objects are of them.
 """
 
 from __future__ import annotations

@@ -295,6 +295,15 @@ def test_a_table_that_is_known_is_where_the_object_stands(depth: np.ndarray, T_o
             scanned_object("mug seen", points, T_object_camera, table=wrong)
 
 
+def test_up_is_a_direction_of_any_length(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    points = depth_points(depth, INTRINSICS)
+    one, other = (scanned_object("mug seen", points, up=length * T_object_camera[2, :3]) for length in (1.0, 7.0))
+    np.testing.assert_allclose(one.cloud, other.cloud, atol=1e-6)
+    for wrong in ([0.0, 0.0, 0.0], [0.0, 1.0], [0.0, np.nan, 1.0]):
+        with pytest.raises(OptionError, match="direction of three numbers"):
+            scanned_object("mug seen", points, up=wrong)
+
+
 @pytest.fixture(scope="module")
 def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What grasps a cloud in the frame of a camera file from above, without what makes good grasps."""

@@ -38,7 +38,7 @@ from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 
-LABEL = "tabletop/13 "
+LABEL = "tabletop/14 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 16  # Most pushes of a flat thing towards an edge (ours)

@@ -108,7 +108,7 @@ class VisibleSide:
     @property
     def upright(self) -> bool:
         """Whether the upward direction is known, and lies along y in the image."""
-        return self.up is not None and abs(self.up[2]) < STRAIGHT_DOWN
+        return self.up is not None and bool(abs(self.up[2]) < STRAIGHT_DOWN)
 
     def guesses(self, count: int) -> list[Guess]:
         """Both sides by the best symmetries that differ, best first; those that preserve the upward direction are preferred."""

@@ -151,14 +151,14 @@ def scanned_object(
         complete: Add the unseen side; switch it off for a scan from all sides.
         keep_table: Keep every point. By default a table in the cloud is found and cut off, with a note, and hands stay above
             it.
-        up: The upward direction in the camera's frame, (3,), which completion prefers; by default the normal of the table,
-            or the wanted frame's z axis.
+        up: The upward direction in the camera's frame, (3,), of any length, which completion prefers; by default the normal
+            of the table, or the wanted frame's z axis.
         table: The plane on which the object stands, where it is cut off already: upward unit normal and height along it, (4,),
             in the camera's frame [m].
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
-        OptionError: The pose is no rigid motion, or the table no plane.
+        OptionError: The pose is no rigid motion, `up` no direction, or the table no plane.
     """
     from dro_grasp.objects.perception.completion import complete_cloud  # it takes a while, and scenes import this
 
@@ -172,7 +172,7 @@ def scanned_object(
     seen, added = kept, np.zeros(0, bool)
     if complete:
         level = plane[:3] if plane is not None else None if T is None else T[2, :3]
-        upward = level if up is None else numbers(up, "up").astype(np.float64)
+        upward = level if up is None else _given_up(up)
         kept, normals, added = complete_cloud(kept, normals, camera, upward, table=plane)
     if T is not None:
         R, t = T[:3, :3], T[:3, 3]
@@ -182,6 +182,13 @@ def scanned_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
     cut_off = () if plane is None or clean.table is None else (table_note(plane, clean.cut, clean.total),)
     return replace(obj, table=plane, notes=(*obj.notes, *clean.notes, *odd, *cut_off))
+
+
+def _given_up(up: ArrayLike) -> Float[np.ndarray, "3"]:
+    upward = numbers(up, "up").astype(np.float64)
+    if upward.shape != (3,) or not np.isfinite(upward).all() or np.linalg.norm(upward) < 1e-6:
+        raise OptionError(f"up is {upward.tolist()}; give a direction of three numbers in the camera's frame, such as 0 -1 0")
+    return upward / np.linalg.norm(upward)
 
 
 def _given_plane(table: ArrayLike) -> Float[np.ndarray, "4"]:
