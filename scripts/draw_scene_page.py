@@ -57,6 +57,7 @@ def main(path: Path) -> None:
             page.get_by_text("grasps can put it at").wait_for(timeout=400_000)
             time.sleep(8)
             page.screenshot(path=path, timeout=300_000)
+    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
 
 
 if __name__ == "__main__":
