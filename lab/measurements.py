@@ -153,7 +153,7 @@ MEASUREMENTS = {
             "auto", hand, OBJECTS["validate"], f"--view {view} --num 16 --stages returned --protocols {FAST}")
         for view in ("cloud", "half", "depth") for hand in PAPER_HANDS}),
     "lifts": Measurement("Arms that see an object in one depth image, plan, grasp, lift, hold and shake it", {
-        **_attempts("cloud", 10), **{f"{robot}, any grasp": _lifts(robot, "random", OBJECTS["test"], 1) for robot in ROBOTS},
+        **_attempts("cloud", 10), **{f"{robot}, any grasp": _lifts(robot, "random", OBJECTS["test"], 5) for robot in ROBOTS},
     }, wings=("arm", "compare")),
     "asked": Measurement("The same, of the thing that is asked for among three others", _attempts("asked", 3),
                          wings=("arm", "compare")),

@@ -24,7 +24,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.network.checkpoints import save_weights
-from dro_grasp.network.completion_network import SHIPPED, SurfaceNetwork
+from dro_grasp.network.completion_network import SHIPPED, SurfaceFeatures, SurfaceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import estimate_normals, mesh_object
 from dro_grasp.objects.perception.completion import CODED, GUESSES, THINNEST, surface_features, to_view_axes
@@ -110,6 +110,11 @@ class Views(NamedTuple):
     """Points of the visible side in view axes [m], and their normals."""
     upright: Float[Tensor, " v"]
     """1 where y is the image of the upward direction, otherwise 0."""
+
+    @property
+    def told(self) -> SurfaceFeatures:
+        """What the network is told."""
+        return SurfaceFeatures(self.guessed, self.features, self.places, self.seen, self.upright)
 
 
 def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
@@ -237,8 +242,9 @@ def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
         # Half of the views are mirrored, left to right: other features stay the same.
         side = torch.ones(VIEWS, 1, 6)
         side[torch.rand(VIEWS, generator=generator) < 0.5] = torch.tensor([-1.0, 1, 1, -1, 1, 1])
-        predicted = network(views.guessed[view, place], views.features[view, place], views.places[view, place] * side[..., :3],
-                            views.seen[view, point] * side, views.upright[view[:, 0]])
+        predicted = network(SurfaceFeatures(
+            views.guessed[view, place], views.features[view, place], views.places[view, place] * side[..., :3],
+            views.seen[view, point] * side, views.upright[view[:, 0]]))
         loss = error(predicted, views.truth[view, place]).mean()
         optimiser.zero_grad()
         (1e3 * loss).backward()
@@ -259,7 +265,7 @@ def errors(network: SurfaceNetwork, views: Views) -> dict[str, dict[str, float]]
         if not len(some.kind):
             continue
         parts = (Views(*part) for part in zip(*(column.split(16) for column in some), strict=True))
-        predicted = torch.cat([network(v.guessed, v.features, v.places, v.seen, v.upright) for v in parts])
+        predicted = torch.cat([network(v.told) for v in parts])
         for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):
             near = some.unseen & (some.truth.abs() < 0.01)
             found[f"{kind}, {name}"] = {

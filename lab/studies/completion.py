@@ -97,12 +97,14 @@ def tile(obj: ObjectModel) -> np.ndarray:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, default=3, help="views of each object")
+    parser.add_argument("--views", type=int, default=3, help="views of each object; 0 for the picture alone")
     parser.add_argument("--picture", type=Path, default=None, help="PNG to draw")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     if options.picture is not None:
         draw(options.picture)
+    if options.views < 1:
+        return
     rows = []
     for view in ("half", "depth"):
         for group in GROUPS:

@@ -126,7 +126,7 @@ def check_robot(name: str | Path) -> RobotReport:
         (pair, count), *_ = met.most_common(1)
         blocking = f"{pair[0]} and {pair[1]}, in {count / len(draws):.0%} of random configurations"
     centre = robot.hand.grasp_centres(torch.from_numpy(robot.T_world_wrist(draws)).float()).double().numpy()
-    height = centre[:, 2] - (robot.table or Table()).height
+    height = centre[:, 2] - robot.usual_table.height
     distance = np.linalg.norm(centre[:, :2] - robot.T_world_base[:2, 3], axis=1)[free & (height > 0) & (height < 0.1)]
     reach = (float(distance.min()), float(distance.max())) if len(distance) else (float("nan"), float("nan"))
     return RobotReport(robot, cell.excluded, tuple(contacts), reach, float(free.mean()), blocking)

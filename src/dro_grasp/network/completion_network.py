@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Num
@@ -14,6 +15,21 @@ SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"  # The shipped n
 LENGTH = 0.01  # Unit of the network's corrections [m]. Source: ours
 UNIT = 0.05  # Length that the network receives as 1 [m] (ours)
 SMALLEST = 0.005  # Least radius of a visible side in the image [m] (ours)
+
+
+class SurfaceFeatures(NamedTuple):
+    """Input of the network at n places of each view."""
+
+    guessed: Float[Tensor, "*v n guesses"]
+    """Signed distances to the guesses [m]."""
+    features: Float[Tensor, "*v n features"]
+    """Other features of each place."""
+    places: Float[Tensor, "*v n 3"]
+    """The places in view axes [m]."""
+    seen: Float[Tensor, "*v m 6"]
+    """Points of the visible side in view axes [m], and their normals."""
+    upright: Float[Tensor, "*v"]
+    """1 where the y axis is the image of the upward direction, 0 where that is not known."""
 
 
 class SurfaceNetwork(nn.Module):
@@ -40,19 +56,9 @@ class SurfaceNetwork(nn.Module):
         with torch.no_grad():
             self.leave.bias[0] = 1.0
 
-    def forward(
-        self, guessed: Float[Tensor, "*v n guesses"], features: Float[Tensor, "*v n features"], places: Float[Tensor, "*v n 3"],
-        seen: Float[Tensor, "*v m 6"], upright: Float[Tensor, "*v"],
-    ) -> Float[Tensor, "*v n"]:
-        """Signed distances to the surface at n places of each view [m].
-
-        Args:
-            guessed: Signed distances to the guesses [m].
-            features: Other features of each place.
-            places: The places in view axes [m].
-            seen: Points of the visible side in view axes [m], and their normals.
-            upright: 1 where the y axis is the image of the upward direction, 0 where that is not known.
-        """
+    def forward(self, told: SurfaceFeatures) -> Float[Tensor, "*v n"]:
+        """Signed distances to the surface at n places of each view [m]."""
+        guessed, features, places, seen, upright = told
         # Both in units of a length, and of the visible side's own radius in the image.
         radius = seen[..., :2].norm(dim=-1).amax(-1)[..., None, None].clamp_min(SMALLEST)
         codes = self.points(torch.cat([seen[..., :3] / UNIT, seen[..., :3] / radius, seen[..., 3:]], -1))

@@ -12,9 +12,9 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
+from dro_grasp.network.completion_network import SurfaceFeatures, SurfaceNetwork, shipped_surface
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.perception.completion import GUESSES, SurfaceFeatures, complete_cloud, surface_features, to_view_axes
+from dro_grasp.objects.perception.completion import GUESSES, complete_cloud, surface_features, to_view_axes
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
 
 FEATURES = 23  # Features of a place
@@ -220,15 +220,15 @@ def test_a_camera_straight_above_knows_no_up_in_its_image() -> None:
 def test_the_network_sees_the_whole_side_and_no_order_of_its_points() -> None:
     torch.manual_seed(0)
     network = shipped_surface()
-    guessed, features, places = 0.01 * torch.randn(2, 7, GUESSES), torch.randn(2, 7, FEATURES), 0.03 * torch.randn(2, 7, 3)
     normals = torch.nn.functional.normalize(torch.randn(2, 60, 3), dim=-1)
-    seen, upright = torch.cat([0.03 * torch.randn(2, 60, 3), normals], -1), torch.tensor([0.0, 1.0])
-    both = network(guessed, features, places, seen, upright)
-    order = torch.randperm(60)
-    torch.testing.assert_close(network(guessed, features, places, seen[:, order], upright), both)
+    told = SurfaceFeatures(
+        0.01 * torch.randn(2, 7, GUESSES), torch.randn(2, 7, FEATURES), 0.03 * torch.randn(2, 7, 3),
+        torch.cat([0.03 * torch.randn(2, 60, 3), normals], -1), torch.tensor([0.0, 1.0]))
+    both = network(told)
+    torch.testing.assert_close(network(told._replace(seen=told.seen[:, torch.randperm(60)])), both)
     for k in range(2):
-        torch.testing.assert_close(network(guessed[k], features[k], places[k], seen[k], upright[k]), both[k])
-    assert (network(guessed, features, places, seen.flip(0), upright) - both).abs().min() > 1e-6
+        torch.testing.assert_close(network(SurfaceFeatures(*(column[k] for column in told))), both[k])
+    assert (network(told._replace(seen=told.seen.flip(0))) - both).abs().min() > 1e-6
 
 
 def test_the_network_is_nearer_to_unseen_surfaces_than_symmetry() -> None:
@@ -249,8 +249,8 @@ def test_the_network_that_ships_is_one_of_these_features() -> None:
     assert network.guesses == GUESSES
     assert not network.training
     with torch.no_grad():
-        far = network(torch.full((1, GUESSES), 0.05), torch.zeros(1, FEATURES), torch.zeros(1, 3), torch.zeros(1, 6),
-                      torch.tensor(0.0))
+        far = network(SurfaceFeatures(
+            torch.full((1, GUESSES), 0.05), torch.zeros(1, FEATURES), torch.zeros(1, 3), torch.zeros(1, 6), torch.tensor(0.0)))
     assert torch.isfinite(far).all()
 
 

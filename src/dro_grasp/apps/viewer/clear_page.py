@@ -10,7 +10,7 @@ from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.clearing.record import ClearRecord, Event, Judgement, Look, Picked
 from dro_grasp.arm.robots.loading import load_robot
-from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.animation import FIXTURE_COLOUR, VIEW, colour_of
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.rendering.rasterizer import Camera
@@ -102,7 +102,7 @@ class ClearPage(ServedPage, Page):
         if not self.cloud.value or camera is None or not 0 <= self._look < len(self.record.clouds):
             return
         points = trimesh.transform_points(self.record.clouds[self._look], camera.T_world_camera)
-        points = points[points[:, 2] > (self.robot.table or Table()).height + ABOVE]
+        points = points[points[:, 2] > self.robot.usual_table.height + ABOVE]
         points = points[:: max(1, len(points) // SEEN)]
         if not len(points):
             return

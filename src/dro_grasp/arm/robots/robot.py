@@ -114,6 +114,11 @@ class Robot:
         return hashlib.sha256(json.dumps(stated, sort_keys=True, default=_rounded).encode()).hexdigest()
 
     @property
+    def usual_table(self) -> Table:
+        """The table; one of usual height and size where none is stated."""
+        return self.table or Table()
+
+    @property
     def working_range(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_arm"]]:
         """The joints' limits, and at most TURN from home."""
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)

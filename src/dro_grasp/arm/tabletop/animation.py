@@ -14,7 +14,7 @@ from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.robot_check import robot_meshes, table_meshes
 from dro_grasp.arm.robots.loading import load_robot
-from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.attempts import Attempt
 from dro_grasp.arm.tabletop.experiment import Watcher, attempt
 from dro_grasp.arm.tabletop.run import TabletopRun
@@ -122,5 +122,5 @@ def _camera(robot: Robot, recorder: Recorder) -> Camera:
     things += [thing.cloud.astype(np.float64) for thing in recorder.fixtures]
     square = 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])  # around the first object [m] (ours)
     around = recorder.frames[0][2][:1, :2, 3] + square
-    corners = np.column_stack([around, np.full(len(around), (robot.table or Table()).height)])
+    corners = np.column_stack([around, np.full(len(around), robot.usual_table.height)])
     return Camera.around(np.concatenate([*moved, *things, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

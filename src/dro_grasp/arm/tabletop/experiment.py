@@ -22,7 +22,7 @@ from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.reachability import ReachConfig
 from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.workcell import Workcell, moved
-from dro_grasp.arm.robots.robot import Robot, Table
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.attempts import Attempt
 from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.placed import draw_place, measured, place_fault
@@ -215,7 +215,7 @@ def _pushed(
         watch.planned(seen, made)
     for stage in SLIDING:
         scene.follow(made.arm, made.hand, made.part(stage), None if watch is None else lambda: watch.moved(scene))
-    table, result = scene.robot.table or Table(), replace(result, pushes=result.pushes + 1)
+    table, result = scene.robot.usual_table, replace(result, pushes=result.pushes + 1)
     if scene.pose(0)[2, 3] < table.height - FALLEN:
         return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
     return result

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from dro_grasp.arm.planning.physics import LiftScene
-from dro_grasp.arm.robots.robot import Table
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.objects.builtin.usual import OBJECTS
 from dro_grasp.objects.catalogue import load_object
@@ -33,7 +32,7 @@ def scatter(scene: LiftScene, region: Region, draw: np.random.Generator, apart: 
 def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator, apart: float = APART) -> bool:
     """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
     low, high = np.array(region[:2]), np.array(region[2:])
-    table, obj = scene.robot.table or Table(), scene.objects[index]
+    table, obj = scene.robot.usual_table, scene.objects[index]
     assert obj.vertices is not None
     for _ in range(20):  # it is put down anew if it rolls off the region
         generator = torch.Generator().manual_seed(int(draw.integers(2**31)))

@@ -20,10 +20,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
-from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import one_per_cell
-from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
+from dro_grasp.network.completion_network import UNIT, SurfaceFeatures, SurfaceNetwork, shipped_surface
 from dro_grasp.objects.perception.resting import set_down
 from dro_grasp.objects.surface_distances import cloud_distances
 
@@ -199,7 +198,6 @@ CELLS = 20_000  # Approximate number of grid cells for the surface (ours): edges
 MARGIN = 0.01  # Distance that the grid extends beyond all guesses [m] (ours)
 SPREAD = 40_000  # Points that are moved onto the surface (ours)
 SMALL = 0.01  # Distance that the network receives as about 1/2 [m] (ours)
-LENGTH = 0.05  # Length that the network receives as 1 [m] (ours)
 
 
 class CompletedCloud(NamedTuple):
@@ -208,20 +206,6 @@ class CompletedCloud(NamedTuple):
     points: Float[np.ndarray, "k 3"]
     normals: Float[np.ndarray, "k 3"]  # outward, of length 1
     added: Bool[np.ndarray, " k"]  # which points are completed, not seen; they come last
-
-
-class SurfaceFeatures(NamedTuple):
-    """Input of the network at n places."""
-
-    guessed: Float[Tensor, "n 5"]  # signed distances to the guesses [m]
-    features: Float[Tensor, "n 23"]
-    """The same distances, squeezed by asinh. Squeezed likewise: distance to the nearest visible point, height over its tangent
-    plane, distance from the image, height over the surface there, heights above the end and the top of the visible side, height
-    above the table, distance of neighbouring pixels. Then: position along the view and across it, the cost of each guess, the
-    visible width, and whether there is a camera, and a table."""
-    places: Float[Tensor, "n 3"]  # in view axes [m]
-    seen: Float[Tensor, "m 6"]  # points of the visible side in view axes [m], and their normals
-    upright: Float[Tensor, ""]  # 1 if y is the image of the upward direction, otherwise 0
 
 
 def complete_cloud(
@@ -316,7 +300,13 @@ def _pitch(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"]) -> 
 
 
 def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.ndarray, "n 3"]) -> SurfaceFeatures:
-    """Input of the network at places in view axes [m]."""
+    """Input of the network at places in view axes [m].
+
+    The other features are distances, squeezed by asinh: those to the guesses, to the nearest visible point, over its tangent
+    plane, from the image, over the surface there, above the end and the top of the visible side, above the table, and between
+    neighbouring pixels. Then come the position along the view and across it, the cost of each guess, the visible width, and
+    whether there is a camera, and a table.
+    """
     guessed = np.stack([cloud_distances(g.points, g.normals, places) for g in guesses], 1)
     distance, nearest = side.tree.query(places)
     over = ((places - side.points[nearest]) * side.normals[nearest]).sum(1)
@@ -328,9 +318,9 @@ def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.n
         np.full(len(places), side.pitch)])
     across = np.linalg.norm(places[:, :2], axis=1)
     known = float(side.camera_distance is not None), float(side.table is not None)
-    whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, *known])
+    whole = np.array([*(g.cost for g in guesses), side.width / UNIT, *known])
     features = np.column_stack([
-        np.arcsinh(metres / SMALL) / 2, height / LENGTH, across / LENGTH, np.broadcast_to(whole, (len(places), len(whole)))])
+        np.arcsinh(metres / SMALL) / 2, height / UNIT, across / UNIT, np.broadcast_to(whole, (len(places), len(whole)))])
     some = side.sample[:CODED]
     seen = np.concatenate([side.points[some], side.normals[some]], 1)
     g, f, p, s = (torch.from_numpy(column).float() for column in (guessed, features, places, seen))
@@ -349,7 +339,7 @@ def extract_surface(
     spacing = float((np.prod(high - low) / CELLS) ** (1 / 3))
     along = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
     places = np.stack(np.meshgrid(*along, indexing="ij"), -1)
-    distances = network(*surface_features(side, guesses, places.reshape(-1, 3))).double().numpy().reshape(places.shape[:3])
+    distances = network(surface_features(side, guesses, places.reshape(-1, 3))).double().numpy().reshape(places.shape[:3])
     model = np.stack([distances, *np.gradient(distances, spacing)], -1)
     inner = RegularGridInterpolator(along, model)
 
