@@ -71,7 +71,7 @@ FULL = Size(
     ranking="--groups assets:train builtin:train builtin:hard_train procedural:0-199 --objects 16 --num 16 "
     "--trials carry robust",
     holding="--groups assets:train builtin:hard_train procedural:200-399 --made 64 --rounds 8 --num 32",
-    completion="--objects assets:train builtin:train procedural:0-199 --steps 8000", into=PACKAGED)
+    completion="--objects assets:train builtin:train procedural:0-199 --steps 12000", into=PACKAGED)
 TINY = Size(
     hands=("gripper3",), held_out=(), made=2, known=("can", "torus"), validate=(), procedural="procedural:0-0",
     part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", most_shipped=6, per_pair=6,

@@ -111,8 +111,7 @@ def test_cameras(case: Case, tmp_path: Path) -> None:
     matrix = case.get("intrinsics", CORPUS["cameras"][0]["intrinsics"])
     if not refused(case, depth_points, image, matrix):
         ball = scanned_object("ball", depth_points(image, matrix))
-        # Away from the camera, the size is a guess.
-        np.testing.assert_array_less(np.abs(100 * np.ptp(ball.cloud, axis=0) - case["size"]), [0.6, 0.6, 1.0])
+        np.testing.assert_allclose(100 * np.ptp(ball.cloud, axis=0), case["size"], atol=0.6)
 
 
 @of("robots")
