@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 from dro_grasp.cli.output import say_aside
 
 if TYPE_CHECKING:
+    from dro_grasp.arm.robots.robot import Robot
+    from dro_grasp.arm.tabletop.table_scene import PickedObject
     from dro_grasp.cli.generate import Generate
     from dro_grasp.cli.robots import Plan
     from dro_grasp.objects.scenery import FoundObject, Scene
 
+TAKEN = "what was taken for the object: {}"
 CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
 
 
@@ -49,5 +52,21 @@ def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
         raise
     if picture is not None:
         draw_scene(scene, found, picture)
-        say_aside(f"what was taken for the object: {picture}")
+        say_aside(TAKEN.format(picture))
     return found
+
+
+def find_on_table(scene: Scene, robot: Robot, command: Plan) -> PickedObject:
+    """The thing on a robot's table that is meant, flat or not; the picture is drawn in either case."""
+    from dro_grasp.arm.tabletop.table_scene import as_picked, picked_flat
+    from dro_grasp.objects.perception.choosing import all_within
+    from dro_grasp.pictures.scene import draw_scene
+
+    flat = None if command.mask is None else picked_flat(scene, robot, command.mask)
+    if flat is None:
+        return as_picked(find_thing(scene, command), robot)
+    if command.scene_picture is not None:
+        assert scene.sight is not None
+        draw_scene(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), command.scene_picture)
+        say_aside(TAKEN.format(command.scene_picture))
+    return flat

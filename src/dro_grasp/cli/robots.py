@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.given_scene import check_choice, find_thing
+from dro_grasp.cli.given_scene import check_choice, find_on_table
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
@@ -201,7 +201,7 @@ class Plan:
         import numpy as np
 
         from dro_grasp.arm.robots.robot import Table
-        from dro_grasp.arm.tabletop.table_scene import PickedObject, as_picked, at_seen_height, picked_flat, seen_on_table
+        from dro_grasp.arm.tabletop.table_scene import PickedObject, at_seen_height, seen_on_table
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
@@ -210,9 +210,7 @@ class Plan:
 
         T, camera = np.eye(4), self._camera(robot)
         if self.scene is not None:
-            scene = seen_on_table(load_scene(self.scene, camera=camera), robot)
-            flat = None if self.mask is None else picked_flat(scene, robot, self.mask)
-            return (as_picked(find_thing(scene, self), robot) if flat is None else flat), T
+            return find_on_table(seen_on_table(load_scene(self.scene, camera=camera), robot), robot, self), T
         assert self.object is not None
         if camera is not None:
             obj = load_scan(given_path(self.object), camera.T_frame_camera)
@@ -227,7 +225,7 @@ class Plan:
             assert robot.table is not None
             T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
         elif obj.table is not None and robot.table is not None:  # it was cut off the cloud
-            robot = at_seen_height(robot, obj)
+            return PickedObject(obj, [], at_seen_height(robot, obj)).noted(robot), T
         return PickedObject(obj, [], robot), T
 
     def _camera(self, robot: Robot) -> SceneCamera | None:

@@ -99,6 +99,23 @@ def test_a_scene_shows_the_height_of_the_table(table_cloud: np.ndarray, robot: d
     picked = pick_object(load_scene(table_cloud + np.array([0, 0, 0.013])), robot, (*CUBE, 0.03))
     assert picked.robot.table is not None
     assert picked.robot.table.height == pytest.approx(0.013, abs=1e-3)
+    assert not any("level plane" in note for note in picked.obj.notes)
+
+
+@pytest.mark.parametrize(("height", "told"), [(-0.02, "2.0 cm below"), (0.1, "10.0 cm above")])
+def test_a_table_elsewhere_than_stated_is_told(
+    table_cloud: np.ndarray, robot: dro.Robot, height: float, told: str
+) -> None:
+    picked = pick_object(load_scene(table_cloud + np.array([0, 0, height])), robot, (*CUBE, 0.03 + height))
+    assert any(f"stands on a level plane {told} the table of robot '{robot.name}'" in note for note in picked.obj.notes)
+
+
+def test_a_table_below_its_stated_height_is_refused(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    """Hands would go through the true one."""
+    scene = load_scene(table_cloud - np.array([0, 0, 0.04]))
+    with pytest.raises(dro.DroGraspError, match=r"at z = -0\.040 m, and its file states 0\.000 m: hands would go through"):
+        pick_object(scene, robot, (*CUBE, -0.01))
+
 
 
 @pytest.mark.parametrize(("rows", "options", "said"), [

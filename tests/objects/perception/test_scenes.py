@@ -187,6 +187,38 @@ def test_two_boxes_that_touch_are_uncertain_and_one_alone_is_not() -> None:
     assert any("two things that touch" in note for note in two.load().chosen().notes)
 
 
+def _large_box() -> MadeScene:
+    """Its lid counts as a table: 0.12 m² of it are seen."""
+    box = trimesh.creation.box((0.35, 0.35, 0.15))
+    box.apply_translation((0, 0, 0.075))
+    return render_scene("table", [box], ("box",), np.random.default_rng(0), 2, width=480)
+
+
+def test_the_side_of_a_large_box_is_told() -> None:
+    scene = _large_box().load()
+    assert len(scene.segments.planes) == 2
+    assert any("one side of a large box" in note for note in scene.chosen().notes)
+    assert not any("large box" in note for note in make_scene("table", 1, 0, width=320).load().chosen().notes)
+
+
+def test_a_mask_says_that_a_level_face_is_of_the_object() -> None:
+    made = _large_box()
+    chosen = made.load().chosen(mask=made.owner == 0)
+    assert overlap(made, 0, chosen.pixels) > WELL
+    assert not any("large box" in note for note in chosen.notes)
+
+
+def test_what_a_mask_shows_beside_its_thing_is_told() -> None:
+    made = make_scene("table", 3, 9, 1, width=480)
+    scene = made.load()
+    both = scene.chosen(mask=(made.owner == 0) | (made.owner == 1))
+    assert any("shows more than one thing" in note for note in both.notes)
+    everything = scene.chosen(mask=np.ones_like(made.owner, bool))
+    assert any("shows more than one thing" in note for note in everything.notes)
+    assert max(overlap(made, k, everything.pixels) for k in range(3)) > WELL, "and no table"
+    assert not any("more than one" in note for note in scene.chosen(mask=made.owner == 1).notes)
+
+
 def test_what_reaches_the_border_is_cut_off() -> None:
     made = make_scene("table", 1, 12, width=480)
     middle = int(np.median(np.nonzero((made.owner == 0).any(0))[0]))

@@ -20,6 +20,8 @@ from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
 OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
+APART = 0.015  # Difference between a table's seen and stated height that is told [m] (ours)
+SUNK = 0.03  # Depth below its stated height at which no table can be [m] (ours)
 BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
 
 
@@ -33,6 +35,17 @@ class PickedObject:
     """The other things, likewise, if there are any. What is below a point that was seen counts as solid."""
     robot: Robot
     """With its table at the height that was seen."""
+
+    def noted(self, stated: Robot) -> PickedObject:
+        """The same, with a note on the object if its table is elsewhere than the robot's is stated to be."""
+        there, given = self.robot.table, stated.table
+        if there is None or given is None or abs(there.height - given.height) < APART:
+            return self
+        way = 100 * (there.height - given.height)
+        note = (f"it stands on a level plane {abs(way):.1f} cm {'above' if way > 0 else 'below'} the table of robot "
+                f"'{stated.name}', and that plane counts as the table. If it stands on the table itself, correct the camera's "
+                "pose, or the table's `height` in the robot file")
+        return replace(self, obj=replace(self.obj, notes=(*self.obj.notes, note)))
 
 
 @checked
@@ -59,7 +72,8 @@ def pick_object(
         name: What to call it; the scene's name by default.
 
     Raises:
-        ObjectError: No level plane, nothing on it, or it is not clear which object is meant.
+        ObjectError: No level plane, nothing on it, or it is not clear which object is meant; or the table is seen below where
+            the robot file states it.
         OptionError: Two choices are given, or the scene lacks what one of them needs.
         RobotError: The robot has no table.
     """
@@ -74,7 +88,7 @@ def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
     level = at_seen_height(robot, found.obj)
     assert level.table is not None
     others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
-    return PickedObject(found.obj, _solid(others, level.table.height), level)
+    return PickedObject(found.obj, _solid(others, level.table.height), level).noted(robot)
 
 
 def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) -> PickedObject | None:
@@ -85,7 +99,7 @@ def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) 
     flat = seen_flat(name or scene.name, sight.world(), within(scene.name, sight, mask), table, sight.T[:3, 3])
     if flat is None:
         return None
-    return PickedObject(flat.obj, flat.others, replace(robot, table=replace(table, height=flat.table)))
+    return PickedObject(flat.obj, flat.others, _with_table_at(robot, table, flat.table)).noted(robot)
 
 
 def seen_on_table(scene: Scene, robot: Robot) -> Scene:
@@ -111,7 +125,7 @@ def at_seen_height(robot: Robot, obj: ObjectModel) -> Robot:
     """The robot with its table at the height of the plane on which an object in the world stands.
 
     Raises:
-        ObjectError: There is no such plane, or it is not level.
+        ObjectError: There is no such plane, it is not level, or it is below the table that the robot file states.
         RobotError: The robot has no table.
     """
     table, plane = _table(robot, obj.name), obj.table
@@ -120,6 +134,14 @@ def at_seen_height(robot: Robot, obj: ObjectModel) -> Robot:
         raise ObjectError(f"the camera sees no level table below '{obj.name}'{tilt}; correct its pose in the robot file, or "
                           "the table's place")
     height = float((plane[3] - plane[:2] @ np.array(table.centre)) / plane[2])
+    return _with_table_at(robot, table, height)
+
+
+def _with_table_at(robot: Robot, table: Table, height: float) -> Robot:
+    """The robot with its table at this height [m], to which hands go down."""
+    if height < table.height - SUNK:
+        raise ObjectError(f"the camera sees the table of robot '{robot.name}' at z = {height:.3f} m, and its file states "
+                          f"{table.height:.3f} m: hands would go through it. Correct the camera's pose, or its `height`")
     return replace(robot, table=replace(table, height=height))
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
-from dro_grasp.objects.perception.segmentation import NOTHING, SPECK, STRUCTURE, Segments
+from dro_grasp.objects.perception.segmentation import BACK, NOTHING, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
 Spot = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # x, y, z [m]
@@ -28,6 +28,11 @@ TOLD = 8  # Things that a message lists (ours)
 ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
 PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
 LEAST_MASK = 60  # Fewest points in a mask (ours)
+COVERED = 0.5  # Share of a plane's points in a mask from which the plane is a face of the object [1] (ours)
+EVERYTHING = 0.9  # Share of all points in a mask from which it says nothing of planes [1] (ours)
+SECOND = 0.5  # Share of another thing's points in a mask from which it is told that the thing is left out [1] (ours)
+JOINED = 0.015  # Distance of a thing's top from the edge of a level face up to which it ends there [m] (ours)
+ALONG = 0.5  # Share of its top at such an edge from which it may be a side of a box [1] (ours)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +93,7 @@ def choose(
                           "(pixel=(U, V)) which")
     if mask is not None:
         own = _masked(name, sight, segments, mask)
-        return _chosen(sight, segments, own, ())
+        return _chosen(sight, segments, own, _left_out(name, sight, segments, mask, own))
     if not segments.count:
         raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
                           "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
@@ -106,15 +111,24 @@ def choose(
                           "on it (at=(X, Y, Z)), a pixel (pixel=(U, V)), its pixels (mask=PNG), or as the nearest to the "
                           "camera (nearest=True)")
     mine = segments.labels == number
-    own, notes = np.flatnonzero(mine & (segments.parts == side) if part else mine), list[str]()
-    if part and len(own) == mine.sum():
-        notes.append("no seam parts it from what it may touch, and all of it counts. If that is too much, give the pixels of "
-                     "what is meant (mask=PNG)")
-    elif not part and segments.seams[number]:
-        notes.append("it may be two things that touch: its surface turns inward along a seam, and both sides count as one. If "
-                     "so, mean the side that you point at (part=True), or give its pixels (mask=PNG)")
-    notes += _beside(sight, segments, own)
-    return _chosen(sight, segments, own, tuple(notes))
+    own = np.flatnonzero(mine & (segments.parts == side) if part else mine)
+    notes = (*_touching(segments, number, mine, part), *_beside(sight, segments, own))
+    return _chosen(sight, segments, own, notes)
+
+
+def _touching(segments: Segments, number: int, mine: Bool[np.ndarray, " n"], part: bool) -> tuple[str, ...]:
+    """A note where what counts as one thing may be two."""
+    divided = bool(segments.parts[mine].any())
+    if part:
+        return () if divided else ("no side of it stands by itself, so all of it counts. If that is too much, give the pixels "
+                                   "of what is meant (mask=PNG)",)
+    if not segments.seams[number]:
+        return ()
+    if divided:
+        return ("it may be two things that touch: its surface turns inward along a seam, or breaks off at a gap, and both "
+                "sides count as one. If so, mean the side that you point at (part=True), or give its pixels (mask=PNG)",)
+    return ("it may be two things that touch, one on the other or in it: its surface turns inward along a seam, and both count "
+            "as one. If so, give the pixels of the one that you mean (mask=PNG)",)
 
 
 def _beside(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
@@ -234,8 +248,14 @@ def within(name: str, sight: Sight, mask: Any) -> Bool[np.ndarray, " n"]:
     return np.asarray(wanted.ravel()[sight.pixels])
 
 
+def all_within(name: str, sight: Sight, segments: Segments, mask: Any) -> Chosen:
+    """All points that a mask is true on, whatever they were taken for; errors are those of `within`."""
+    return _chosen(sight, segments, np.flatnonzero(within(name, sight, mask)), ())
+
+
 def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
-    own = np.flatnonzero(within(name, sight, mask) & (segments.labels != STRUCTURE))
+    inside = within(name, sight, mask)
+    own = np.flatnonzero(inside & ((segments.labels != STRUCTURE) | _faces(sight, segments, inside)))
     if len(own) < LEAST_MASK:
         raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
                           f"needed; give one that is true on the object. '{name}' shows {listed(sight, segments)}")
@@ -244,8 +264,58 @@ def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.nd
     if (labels >= 0).any():
         most = np.bincount(labels[labels >= 0]).argmax()
         near = KDTree(sight.points[own[labels == most]]).query(sight.points[own])[0] < BESIDE
-        own = own[near]
+        own = own[near | (labels == STRUCTURE)]
     return own
+
+
+def _faces(sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Points of planes that lie within a mask for the most part: faces of the object, and no table or wall."""
+    faces = np.zeros(len(inside), bool)
+    rows = np.flatnonzero(segments.labels == STRUCTURE)
+    if not len(rows) or not segments.planes or inside.mean() > EVERYTHING:
+        return faces
+    planes = np.array(segments.planes)
+    plane = np.abs(sight.points[rows] @ planes[:, :3].T - planes[:, 3]).argmin(1)
+    covered = np.bincount(plane, inside[rows], len(planes)) > COVERED * np.bincount(plane, minlength=len(planes))
+    faces[rows] = covered[plane]
+    return faces
+
+
+def _left_out(
+    name: str, sight: Sight, segments: Segments, mask: Any, own: Int[np.ndarray, " k"]
+) -> tuple[str, ...]:
+    """A note on other things that a mask shows as well."""
+    left = within(name, sight, mask)
+    left[own] = False
+    things = segments.labels >= 0
+    left = np.bincount(segments.labels[left & things], minlength=segments.count)
+    told = np.flatnonzero(left > SECOND * np.bincount(segments.labels[things], minlength=segments.count))
+    if not len(told):
+        return ()
+    world = sight.world()
+    places = "; ".join(place_of(world[segments.labels == k]) for k in told[:TOLD])
+    return (f"the mask shows more than one thing: the largest counts, and what is at {places} is an obstacle. Give "
+            "a mask for each object",)
+
+
+def _side_of_box(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], below: int) -> tuple[str, ...]:
+    """A note where a thing ends at a level face, which counts as a table: it may be one side of a large box."""
+    up = segments.planes[below][:3]
+    boards = segments.labels == STRUCTURE
+    boards[own] = False
+    for k, plane in enumerate(segments.planes):
+        if k == below or plane[:3] @ up < 0.97:
+            continue
+        # What is just below the face counts as the edge of its board.
+        height = sight.points @ plane[:3] - plane[3]
+        edge = np.flatnonzero(boards & (height > -BACK - JOINED) & (height < JOINED))
+        top = float(np.quantile(height[own], 0.98))
+        if len(edge) and -BACK - JOINED < top < JOINED:
+            ends = own[height[own] > top - JOINED]
+            if float((KDTree(sight.points[edge]).query(sight.points[ends])[0] < JOINED).mean()) > ALONG:
+                return ("it ends at a level face that counts as a table of its own, so it may be one side of a large box, and not "
+                        "all of it. If so, give the pixels of all of the box (mask=PNG)",)
+    return ()
 
 
 def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...]) -> Chosen:
@@ -261,6 +331,7 @@ def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes:
         plane = segments.planes[below]
         # Hands stay above the table by another way.
         avoided &= (labels >= 0) | (np.abs(sight.points @ plane[:3] - plane[3]) > ON_TABLE)
+        notes = (*notes, *_side_of_box(sight, segments, own, below))
     return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
 
 

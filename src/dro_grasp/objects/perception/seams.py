@@ -1,4 +1,4 @@
-"""Things that touch, parted where the surface turns inward between two parts that each stand by themselves."""
+"""Things that touch, parted where the surface turns inward or breaks off between two parts that each stand by themselves."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
+BREAK = 1.5  # Distance of neighbours across a gap, in cubes [1] (ours): those of an even surface are nearer
+ACROSS = 0.6  # Cosine between a gap and the ray to it below which it is seen across [1] (ours)
 PART = 0.1  # Share of a thing that each side of a seam has, at least [1] (ours)
 LEAST_PART = 24  # Filled cubes of each, at least (ours): as of a thing
 FOOT = 0.03  # Height above a plane up to which a part is seen to stand on it [m] (ours): cubes below 2 cm may be the plane's
@@ -55,7 +57,7 @@ def joined(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " count
 def parted(
     surface: Surface, own: Int[np.ndarray, " o"], levels: list[Float[np.ndarray, "4"]]
 ) -> tuple[Int[np.ndarray, " o"], bool]:
-    """Which of the things that may touch each cube of a thing is, numbered from 0; and whether any seam runs over it.
+    """Which of the things that may touch each cube of a thing is, numbered from 0; and whether any seam or gap runs over it.
 
     Parts that a seam divides may be things of their own if at least two of them reach down to a plane, or may do so out of
     sight, and they are not within each other. The concave edges are those of Stein et al. 2014; the rest is ours.
@@ -65,20 +67,28 @@ def parted(
 
 
 def _sides(surface: Surface, own: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
-    """The parts into which a thing falls where its surface turns inward."""
+    """The parts into which a thing falls where its surface turns inward, or breaks off."""
     place = np.full(len(surface.cells), -1)
     place[own] = np.arange(len(own))
     mine = place[surface.pairs[(place[surface.pairs] >= 0).all(1)]]
     cells, normals = surface.cells[own], surface.normals[own]
     i, j = mine.T
     between = cells[j] - cells[i]
-    between = between / np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
+    apart = np.linalg.norm(between, axis=1)
+    between = between / np.maximum(apart, 1e-9)[:, None]
     # Normals of a convex surface turn away from each other, those at a seam towards each other.
     inward = ((normals[i] - normals[j]) * between).sum(1)
     seam = np.bincount(mine[inward > CONCAVE].ravel(), minlength=len(own)) > 0
-    part = joined(mine[~seam[mine].any(1)], len(own))
-    large = np.flatnonzero(np.bincount(part) >= max(PART * len(own), LEAST_PART))
-    return _nearest(cells, part, large)
+    # A camera sees a gap between things across its rays; along them, a surface hides a part of itself.
+    rays = cells[i] - surface.camera
+    along = np.abs((rays * between).sum(1)) / np.linalg.norm(rays, axis=1)
+    gap = (apart > BREAK * surface.edge) & (along < ACROSS)
+    for joins in (~gap, ~seam[mine].any(1)):
+        part = joined(mine[joins], len(own))
+        large = np.flatnonzero(np.bincount(part) >= max(PART * len(own), LEAST_PART))
+        if len(large) > 1:
+            return _nearest(cells, part, large)
+    return np.zeros(len(own), int)
 
 
 def _nearest(
