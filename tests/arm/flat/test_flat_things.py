@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import dro_grasp as dro
 from dro_grasp.apps.viewer.lift_page import Film
@@ -25,6 +26,8 @@ from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt, carry_out
+from dro_grasp.cli.given_scene import find_on_table
+from dro_grasp.cli.robots import Plan
 from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.perception.scene_files import SceneCamera
@@ -114,7 +117,7 @@ def test_a_thing_far_from_the_camera_keeps_what_overhangs() -> None:
     assert np.allclose(obj.vertices[:, :2].max(0), flat.max(0), atol=0.004)
 
 
-def test_what_is_seen_flat(narrow: Robot) -> None:
+def test_what_is_seen_flat(narrow: Robot, tmp_path: Path) -> None:
     """Table and card, and a can beside it, which is not flat."""
     draw = np.random.default_rng(3)
     plane = np.column_stack([draw.uniform((0.2, -0.25), (0.8, 0.25), (6000, 2)), draw.normal(TABLE.height, 0.001, 6000)])
@@ -137,6 +140,13 @@ def test_what_is_seen_flat(narrow: Robot) -> None:
     assert picked.robot.table is not None
     assert picked.robot.table.height == pytest.approx(TABLE.height, abs=3e-4)
     assert picked.robot.table.size == narrow.table.size  # type: ignore[union-attr]
+    choice = Plan("xarm7_leaphand", scene=Path("scene"), mask=tmp_path / "m.png", scene_picture=tmp_path / "s.png")
+    Image.fromarray(255 * of_card[None].astype(np.uint8)).save(tmp_path / "m.png")
+    again = find_on_table(scene, narrow, choice)
+    assert np.allclose(again.obj.centre_of_mass, found.obj.centre_of_mass, atol=1e-4)
+    with Image.open(tmp_path / "s.png") as drawn:
+        colours = np.unique(np.asarray(drawn.convert("RGB"))[:450].reshape(-1, 3).astype(int), axis=0)
+    assert (colours @ (1, 0, -1)).max() > 60, "the card is orange"
     with pytest.raises(ObjectError, match="has 10 points, and at least 30 are needed"):
         flat_object("card", card_points(draw)[:10], EYE, 0.0)
 
