@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import lzma
 import os
 import secrets
 import shlex
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -21,6 +22,8 @@ from safetensors import SafetensorError
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
 MAX_QUOTED_CHARS = 200  # Characters of a path or a reason that an error repeats (ours)
+CAMERA = ("frame", "T_frame_camera", "intrinsics", "depth_unit")  # Entries of a camera's file
+LIKE = 0.5  # Share of equal letters from which a word may stand for another (ours)
 SAME = {".yaml": ".yml", ".html": ".htm"}  # Endings of file names, and others that mean the same
 FOREIGN = (
     OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
@@ -48,6 +51,16 @@ def given_path(name: Path | str) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise OptionError(f"{str(name)[:MAX_QUOTED_CHARS]!r} is no path of a file ({reason}); check its spelling") from error
     return path
+
+
+def require_known(values: Mapping[str, object], known: Sequence[str], origin: object) -> None:
+    """Refuse entries of a file that nobody reads, by an OptionError that lists the known ones and names a similar one."""
+    for entry in values:
+        if entry not in known:
+            alike = {name.lower(): name for name in known}
+            near = [alike[name] for name in difflib.get_close_matches(entry.lower(), alike, n=1, cutoff=LIKE)]
+            raise OptionError(f"{origin} has an entry '{entry}', which nothing reads; known are {', '.join(known)}"
+                              + (f". Call it '{near[0]}', if that is meant" if near else ". Leave it out"))
 
 
 def command(*words: object) -> str:

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import load_grasps
 from dro_grasp.grasps.sources import frame_of, object_of
+from dro_grasp.objects import scenery
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.predictor import GraspPredictor
 from tests.helpers.made_scenes import MadeScene, make_scene
 
 
@@ -78,3 +82,53 @@ def test_what_contradicts_a_scene_is_refused(common: list[str], more: list[str],
 def test_options_of_a_scene_need_one(weights: str, capsys) -> None:
     assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--nearest"]) == 2
     assert "--nearest concern a scene" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("more", "told"), [
+    (["--protocol", "carry"], "--protocol carry asks for a trial in simulation, and a thing of a scene is a bare point cloud"),
+    (["--only-successful"], "--only-successful asks for a trial in simulation, and a thing of a scene is a bare point cloud"),
+    (["--keep-table"], "the table of a scene is found in any case"),
+])
+def test_what_no_scene_can_do_is_refused_before_it_is_read(
+    common: list[str], more: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise AssertionError("the scene is read")
+
+    monkeypatch.setattr(scenery, "load_scene", none)
+    assert main([*common, "--nearest", *more]) == 2
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("more", [["--protocol", "carry"], ["--only-successful"]])
+@pytest.mark.parametrize("seen", [False, True])
+def test_trials_of_clouds_are_refused_before_grasps_are_predicted(
+    common: list[str], made: MadeScene, seen: bool, more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise AssertionError("grasps are predicted")
+
+    monkeypatch.setattr(GraspPredictor, "run_many", none)
+    np.save(tmp_path / "points.npy", load_object("sphere").cloud + np.array([0, 0, 0.5 * seen]))
+    start, camera = common[:common.index("--scene")], common[common.index("--camera"):] if seen else []
+    assert main([*start, "--object", str(tmp_path / "points.npy"), *camera, *more]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "bare point cloud" in told or "'points' gets none" in told
+
+
+def test_successful_grasps_alone_need_a_trial(weights: str, capsys) -> None:
+    assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--only-successful", "--protocol",
+                 "none"]) == 2
+    assert "--protocol none asks for none" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_page_that_cannot_be_shown_is_refused_before_the_work(
+    weights: str, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise AssertionError("grasps are predicted")
+
+    monkeypatch.setattr(GraspPredictor, "run_many", none)
+    monkeypatch.setitem(extras.EXTRAS, "apps", ("no_such_package",))
+    assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--view"]) == 2
+    assert "no_such_package" in capsys.readouterr().err

@@ -8,11 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import trimesh
 
 import dro_grasp as dro
 from dro_grasp.cli import output
+from dro_grasp.cli.generate import Generate
+from dro_grasp.cli.inputs import load_obstacle
 from dro_grasp.cli.main import main
-from dro_grasp.cli.switches import in_switches
+from dro_grasp.cli.robots import Plan
+from dro_grasp.cli.switches import in_switches, use_options_of
 
 SOURCE = Path(__file__).parents[2] / "src" / "dro_grasp"
 SWITCH = re.compile(r"(?<![\w-])--[a-z]")
@@ -68,3 +72,44 @@ def test_python_and_command_line_are_each_told_in_their_words(capsys: pytest.Cap
     assert capsys.readouterr().out == "better: --scale 0.01\n"
     output.say_aside("better: scale=0.01")
     assert capsys.readouterr().err == "better: --scale 0.01\n"
+
+
+@pytest.mark.parametrize(("told", "generated", "planned"), [
+    ("give scale=0.001", "give --scale 0.001", "give a file with all coordinates times 0.001"),
+    ("its unit (scale=...)", "its unit (--scale)", "its unit (a file in metres)"),
+    ("with keep_table=True", "with --keep-table", "with load_object(..., keep_table=True) in Python"),
+    ("direction=..., place=...", "--direction, place=...", "--direction, --place"),
+])
+def test_a_command_is_told_of_its_own_options_alone(told: str, generated: str, planned: str) -> None:
+    try:
+        use_options_of(Generate("gripper3"))
+        assert in_switches(told) == generated
+        use_options_of(Plan("robot"))
+        assert in_switches(told) == planned
+    finally:
+        use_options_of(None)
+
+
+@pytest.mark.parametrize("command", [
+    ["plan", "--object"], ["tabletop", "--objects"], ["clear", "--objects"], ["generate", "--hand", "gripper3", "--object"]])
+def test_no_command_is_told_of_a_scale_that_it_lacks(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trimesh.creation.box((60, 50, 100)).export(tmp_path / "mm.stl")
+    robot = [] if command[0] == "generate" else ["--robot", "xarm7_leaphand"]
+    assert main([command[0], *robot, *command[1:], str(tmp_path / "mm.stl")]) == 2
+    told = capsys.readouterr().err
+    assert "measures 100 m" in told
+    assert ("--scale" in told) == (command[0] == "generate")
+    assert ("a file with all coordinates times 0.001 for millimetres" in told) == (command[0] != "generate")
+    assert in_switches("scale=2") == "--scale 2", "of all commands, once none runs"
+
+
+def test_what_is_no_obstacle_is_referred_to_surroundings(tmp_path: Path) -> None:
+    trimesh.creation.box((1.2, 1.2, 0.1)).export(tmp_path / "wall.stl")
+    with pytest.raises(dro.DroGraspError, match=r"too large for an obstacle.*with --surroundings, a mesh or cloud of any size"):
+        load_obstacle(str(tmp_path / "wall.stl"))
+    with pytest.raises(dro.DroGraspError) as caught:
+        load_obstacle("nothing_of_that_name")
+    assert "--surroundings" not in str(caught.value)
+    assert load_obstacle("can").name == "can"

@@ -53,6 +53,12 @@ READER = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
         (claw(joints=joint("a", "palm", "left", "0 0 0", kind="rotary") + joint("b", "palm", "right", "0 0 0")), "'rotary'"),
         (claw(joints=joint("a", "palm", "left", "0 0 0", more=LIMIT + '<mimic joint="b"/>')
               + joint("b", "palm", "right", "0 0 0", more=LIMIT + '<mimic joint="a"/>')), "cycle (a -> b -> a)"),
+        (claw(joints=joint("a", "palm", "left", "0 0 0", more=LIMIT + '<mimic joint="a"/>')
+              + joint("b", "palm", "right", "0 0 0")), "joint 'a' follows itself"),
+        (claw(links=link("left") + link("right") + link("tip"),
+              joints=joint("a", "palm", "left", "0 0 0", more=LIMIT + '<mimic joint="b"/>')
+              + joint("b", "palm", "right", "0 0 0", more=LIMIT + '<mimic joint="c"/>')
+              + joint("c", "right", "tip", "0 0 0", more=LIMIT + '<mimic joint="a"/>')), "cycle (a -> b -> c -> a)"),
         (claw(joints=joint("a", "palm", "left", "0 0 0") + joint("a", "palm", "right", "0 0 0")), "two joints are called 'a'"),
         (claw(link("left")), "two links are called 'left'"),
         (claw(joints=joint("a", "palm", "left", "nan 0 0") + joint("b", "palm", "right", "0 0 0")), "of link 'left' is nan"),
@@ -79,6 +85,8 @@ def test_bad_urdf_is_refused(tmp_path: Path, text: str, told: str) -> None:
         ('<mujoco><asset><mesh name="m" file="m.stl"/></asset><worldbody><body><joint/><geom type="mesh" mesh="m"/></body>'
          "</worldbody></mujoco>", "m.stl"),
         ('<mujoco><worldbody><body><hinge/></body></worldbody></mujoco>', "hinge"),
+        ('<mujoco><worldbody><body><geom size="0.05"/><body><joint name="j" axis="1 0 0" range="0 1"/><geom size="0.05"/></body>'
+         '</body></worldbody><equality><joint joint1="j" joint2="j"/></equality></mujoco>', "joint 'j' follows itself"),
     ],
 )
 def test_bad_mjcf_is_refused(tmp_path: Path, text: str, told: str) -> None:

@@ -220,3 +220,47 @@ def test_files_that_a_mesh_names_are_plain_ones_beside_it(tmp_path: Path) -> Non
         (tmp_path / "in" / "model.gltf").write_text(text)
     with pytest.raises(ObjectError, match="no such file beside it"):
         load_file(tmp_path / "in" / "model.gltf")
+
+
+def sides_of(extents: tuple[float, float, float], *normals: tuple[int, int, int]) -> trimesh.Trimesh:
+    """A box of which the sides with these normals are there alone."""
+    mesh = trimesh.creation.box(extents)
+    mesh.update_faces((mesh.face_normals @ np.transpose(normals) > 0.9).any(1))
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+CUBE = (0.1, 0.1, 0.1)
+DOWN, LEFT, RIGHT, FRONT, BACK = (0, 0, -1), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0)
+
+
+@pytest.mark.parametrize("mesh", [
+    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 1, 2], [0, 3, 1]]),
+    sides_of(CUBE, DOWN, LEFT), sides_of(CUBE, DOWN, LEFT, RIGHT), sides_of(CUBE, DOWN, LEFT, FRONT),
+    sides_of(CUBE, LEFT, RIGHT),
+], ids=["two triangles", "two sides", "three sides in a row", "a corner", "two sides apart"])
+def test_open_sheets_of_few_faces_are_refused(mesh: trimesh.Trimesh, tmp_path: Path) -> None:
+    with pytest.raises(ObjectError, match="is an open sheet and encloses nothing"):
+        load_file(save(mesh, tmp_path / "sheet.stl"))
+
+
+@pytest.mark.parametrize(("mesh", "volume"), [
+    (sides_of(CUBE, DOWN, LEFT, RIGHT, FRONT, BACK), 1e-3),
+    (sides_of((0.2, 0.2, 0.02), DOWN, LEFT, RIGHT, FRONT, BACK), 8e-4),
+    (sides_of(CUBE, LEFT, RIGHT, FRONT, BACK), 1e-3),
+    (trimesh.Trimesh(*(lambda box: (box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3)))(trimesh.creation.box(CUBE)),
+                     process=False), 1e-3),
+], ids=["without a lid", "a tray", "a tube", "loose faces"])
+def test_open_meshes_of_few_faces_that_enclose_are_taken(mesh: trimesh.Trimesh, volume: float, tmp_path: Path) -> None:
+    obj = load_file(save(mesh, tmp_path / "open.stl"))
+    assert obj.volume == pytest.approx(volume, rel=0.15)
+
+
+def test_loose_faces_of_a_hollow_thing_are_no_sheet(tmp_path: Path) -> None:
+    """A frame of two bars whose faces do not meet, and which fills a third of its hull."""
+    bars = [trimesh.creation.box((0.1, 0.02, 0.02)).apply_translation((0.05, 0, 0)),
+            trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0, 0, 0.061))]
+    corners = trimesh.util.concatenate(bars).triangles.reshape(-1, 3)
+    apart = corners + np.random.default_rng(0).normal(0, 1e-5, corners.shape)
+    obj = load_file(save(trimesh.Trimesh(apart, np.arange(72).reshape(-1, 3), process=False), tmp_path / "bars.ply"))
+    np.testing.assert_allclose(np.ptp(obj.cloud, axis=0), np.ptp(corners, axis=0), atol=2e-3)

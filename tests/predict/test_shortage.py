@@ -17,6 +17,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.variants import vary_hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict import finish
 from dro_grasp.predict.config import PredictorConfig
@@ -176,3 +177,27 @@ def test_commands_tell_the_default() -> None:
     for file in ("generate", "robots", "benchmark"):
         text = (Path(finish.__file__).parents[1] / "cli" / f"{file}.py").read_text()
         assert f'optional("P", "{LEAST:g}' in text
+
+
+@pytest.mark.parametrize(("source", "advised"), [("auto", False), ("optimiser", True)])
+def test_the_source_auto_is_advised_only_where_another_was_asked_for(
+    predictor: GraspPredictor, tmp_path: Path, source: str, advised: bool
+) -> None:
+    """Beside what lies flat the network is not asked, so that the optimiser is alone either way."""
+    plate = box(tmp_path, 0.3, 0.3, 0.01)
+    hand = loaded_hand("gripper3")
+    assert GraspProblem(hand, plate, constraints=Constraints(table=-0.005)).lies_flat
+    with pytest.raises(NoGraspError) as caught:
+        predictor.predict(hand, plate, num=1, table=-0.005, candidates=1, source=source)
+    assert ("use the source 'auto'" in str(caught.value)) == advised
+
+
+def test_frames_of_obstacles_are_doubted_only_where_they_were_given(jaws: Hand, tmp_path: Path) -> None:
+    obj, points = box(tmp_path, 0.05, 0.05, 0.2), np.random.default_rng(0).uniform(0.1, 0.2, (50, 3))
+    given = load_scene(points)
+    rest = Scene("what else is seen", points)
+    told = {name: Tally(0, 20).in_words(GraspProblem(jaws, obj, constraints=Constraints(obstacles=obstacles)), 4, alone=False)
+            for name, obstacles in (("given", given), ("seen", rest), ("both", given.joined(rest)))}
+    assert {name: "check that obstacles is in the object's frame" in text for name, text in told.items()} == {
+        "given": True, "seen": False, "both": True}
+    assert "or make room around the object" in told["seen"].lower()

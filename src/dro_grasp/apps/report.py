@@ -89,9 +89,12 @@ def protocol_for(obj: ObjectModel, given: str | None) -> str:
     return given or (NO_TRIAL if obj.is_cloud else DEFAULT_PROTOCOL)
 
 
-def require_trial(obj: ObjectModel, given: str | None) -> None:
-    """Refuse to keep the successful grasps of an object that gets no trial: OptionError."""
-    if protocol_for(obj, given) == NO_TRIAL:
+def require_trial(obj: ObjectModel, given: str | None, only_successful: bool) -> None:
+    """Refuse a trial of a bare cloud, and to keep the successful grasps of what gets none: OptionError."""
+    if obj.is_cloud and given not in {None, NO_TRIAL}:
+        raise OptionError(f"protocol='{given}' asks for a trial, and '{obj.name}' is a bare point cloud; a trial needs a mesh "
+                          "(object=...), or leave out protocol=...")
+    if only_successful and protocol_for(obj, given) == NO_TRIAL:
         raise OptionError(f"only_successful=True saves what passed a trial, and '{obj.name}' gets none; name a "
                           "protocol=..., which needs a mesh, or leave out only_successful=...")
 

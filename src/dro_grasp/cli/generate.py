@@ -178,8 +178,25 @@ class Generate:
         return str(self.scene) if self.object is None else self.object
 
     def check_scene(self) -> None:
-        """Refuse options that contradict one another, by an OptionError."""
+        """Refuse options that contradict one another or the kind of object, by an OptionError."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.extras import require_extra
+
         check_choice(self)
+        if self.scene is not None and self.keep_table:
+            raise OptionError("--keep-table keeps a table that is in an object's own cloud; leave it out: the table of a scene "
+                              "is found in any case, and hands stay above it")
+        what = "a thing of a scene" if self.scene is not None else "what a camera sees" if self.camera is not None else None
+        tried = self.protocol not in {None, "none"}
+        if what is not None and (tried or self.only_successful):
+            option = f"--protocol {self.protocol}" if tried else "--only-successful"
+            raise OptionError(f"{option} asks for a trial in simulation, and {what} is a bare point cloud, which gets none; "
+                              f"leave {option} out, or give the object's mesh with --object")
+        if self.only_successful and self.protocol == "none":
+            raise OptionError("--only-successful saves what passed a trial, and --protocol none asks for none; leave one of "
+                              "them out")
+        if self.view:
+            require_extra("apps")
 
     def _parts(self, jobs: list[Any]) -> list[list[Any]]:
         """Objects that are predicted together: one by one on the CPU."""
@@ -223,8 +240,7 @@ class Generate:
         with progress_bar(f"reading {Path(name).name}", self.json):
             obj = self._load(name, job.camera) if job.found is None else self._weighed(job.found.obj)
         seconds = time.perf_counter() - begin
-        if self.only_successful:
-            require_trial(obj, self.protocol)
+        require_trial(obj, self.protocol, self.only_successful)
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         if (warning := doubt(job.constraints, obj, job.camera is not None)) is not None:

@@ -11,6 +11,7 @@ from dro_grasp.simulation.protocols import PROTOCOLS
 
 if TYPE_CHECKING:
     from dro_grasp.objects.scenery import Scene
+    from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.predict.constraints import Constraints
 
     ProtocolName = str
@@ -27,6 +28,26 @@ Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and
 def optional(metavar: str, default: str) -> Any:
     """Help settings of an option without a default value: its metavar, and a description of the default."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+def load_obstacle(name: str) -> ObjectModel:
+    """A thing that is not grasped, and on which another may be put.
+
+    Raises:
+        ObjectError: It cannot be loaded as a thing; of a file the message says how anything else is avoided.
+    """
+    from dro_grasp.errors import ObjectError
+    from dro_grasp.files import given_path
+    from dro_grasp.objects.catalogue import load_object
+
+    try:
+        return load_object(name)
+    except ObjectError as error:
+        if not given_path(name).is_file():
+            raise
+        told = str(error).replace("for a hand to grasp", "for an obstacle")
+        raise ObjectError(f"{told}. Obstacles are closed things of 5 mm to 1 m; anything else to stay clear of is given with "
+                          "--surroundings, a mesh or cloud of any size") from error
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dro_grasp.cli.listing import Hands, Objects, Weights
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.output import say_aside
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
-from dro_grasp.cli.switches import in_switches
+from dro_grasp.cli.switches import in_switches, use_options_of
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
@@ -147,7 +147,9 @@ def run(arguments: Sequence[str]) -> int:
         if arguments in (["--version"], ["-V"]):
             print(f"dro-grasp {__version__}")
             return DONE
-        return parse(without_threads(arguments)).run()
+        command = parse(without_threads(arguments))
+        use_options_of(command)
+        return command.run()
     finally:
         print(end="", flush=True)  # what nobody reads fails here rather than while Python ends
 
@@ -175,3 +177,5 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"internal error: {type(error).__name__}: {error}\nThis is a bug in dro-grasp, not in your input. "
                   "Run again with --verbose and report the traceback.", file=sys.stderr)
         return FAILED
+    finally:
+        use_options_of(None)

@@ -4,24 +4,51 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
+from typing import Any
 
 ARGUMENT = re.compile(r"(?<![\w.`'/+-])([a-z][a-z0-9_]*)=(\.\.\.|\([^()\n]*\)|'[^'\n]*'|[\w+-]+(?:\.[\w+-]+)*)")
 """An argument with its value, as Python has it; `...` stands for any value."""
+INSTEAD = {
+    "scale": ("a file in metres", "a file with all coordinates times {}"),
+    "keep_table": ("load_object with keep_table in Python", "load_object(..., keep_table={}) in Python"),
+}
+"""What helps where a command has no such option: of any value, and of a certain one."""
+
+_running: list[frozenset[str]] = []  # Options of the command that runs; empty while none does
+
+
+def use_options_of(command: Any | None) -> None:
+    """From now on, let messages speak of the options of this command alone; of those of all commands for None."""
+    _running[:] = [] if command is None else [frozenset(_names(command))]
 
 
 def in_switches(text: str) -> str:
-    """A message with the options of commands in place of arguments of their names; the rest stays."""
+    """A message with the options of the running command in place of arguments of their names; the rest stays.
+
+    What is said of a scale or a table that this command cannot be told becomes what helps instead.
+    """
     return ARGUMENT.sub(_switch, text)
 
 
 def _switch(found: re.Match[str]) -> str:
     name, value = found.groups()
-    if name not in _options():
-        return found[0]
-    words = "" if value in {"...", "True"} else value.strip("()'").replace(",", "")
-    return f"--{name.replace('_', '-')}" + (f" {words}" if words else "")
+    if name in (_running[0] if _running else _options()):
+        words = "" if value in {"...", "True"} else value.strip("()'").replace(",", "")
+        return f"--{name.replace('_', '-')}" + (f" {words}" if words else "")
+    if _running and name in INSTEAD:
+        return INSTEAD[name][value != "..."].format(value)
+    return found[0]
+
+
+def _names(command: Any) -> Iterator[str]:
+    """Names of a command's options, those of its groups included."""
+    for field in fields(command):
+        yield field.name
+        if is_dataclass(group := getattr(command, field.name)):
+            yield from _names(group)
 
 
 @cache

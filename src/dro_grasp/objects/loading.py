@@ -279,6 +279,14 @@ def _scale_hint(largest: float, origin: str) -> str:
 LEAST_FILL = 1e-3
 """Share of its bounding box that a hull must fill, and share of its hull that a closed mesh must fill (ours); less is a
 sheet."""
+BORDER = 0.4
+"""Share of the length of all edges from which on those of one face alone make a mesh open (ours): a box without its lid has
+0.2, a tube 0.45, two triangles 0.8."""
+INSIDE = 0.75  # Winding number from which on a place is surely inside a mesh [1] (ours)
+OUTSIDE = 0.25  # Winding number up to which a place is surely outside [1] (ours)
+ENCLOSED = (0.2, 0.8)
+"""What an open mesh encloses (ours): places surely inside, over those not surely outside, and places more inside than
+outside, over its convex hull. With less than both it is a sheet: two sides of a box have 0 and 0.4, a tray has 0.05 and 1."""
 OVERLAP = 1e-3  # Share of the volume by which bodies may overlap without being joined (ours)
 
 MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
@@ -286,14 +294,33 @@ MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 
 
 def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
-    """Refuse faces without area, and soups of faces, in which inside and outside take minutes to tell, by an ObjectError."""
+    """Refuse faces without area, soups of faces, and open sheets of few faces, by an ObjectError."""
     if not (len(mesh.faces) and mesh.nondegenerate_faces().any()):
         raise ObjectError(f"{origin} has {len(mesh.faces)} faces, none of which has an area; give a triangle mesh of a solid")
     edges = mesh.faces_unique_edges[mesh.unique_faces()]  # a face and its reverse side count once
     alone = float((np.unique(edges, return_counts=True)[1] == 1).mean())
-    if len(mesh.faces) > 100 and alone > 0.9:  # (ours) fewer faces are quick, whatever they are
+    if len(mesh.faces) > 100 and alone > 0.9:  # (ours) their inside takes minutes to tell
         raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
                           "alone; join the faces (merge vertices), or give a point cloud of the surface")
+    if (border := _border(mesh)) > BORDER and _is_sheet(mesh):
+        raise ObjectError(f"{origin} is an open sheet and encloses nothing: {border:.0%} of the length of the edges of its "
+                          f"{len(mesh.faces)} faces belongs to one face alone; close it, give it a thickness, or give a point "
+                          "cloud of the surface")
+
+
+def _border(mesh: trimesh.Trimesh) -> float:
+    """Share of the length of all edges that belongs to one face alone [1]; a face and its reverse side count once."""
+    faces = np.bincount(mesh.faces_unique_edges[mesh.unique_faces()].ravel(), minlength=len(mesh.edges_unique_length))
+    return float(mesh.edges_unique_length[faces == 1].sum() / max(mesh.edges_unique_length.sum(), 1e-12))
+
+
+def _is_sheet(mesh: trimesh.Trimesh) -> bool:
+    """Whether an open mesh encloses next to nothing, by winding numbers; flat ones, which have no hull, are refused later."""
+    if (hull := _hull(mesh)) is None or hull.volume < LEAST_FILL * float(np.prod(mesh.extents)):
+        return False
+    winding, _, cell = _winding(mesh)
+    inside, more, maybe = (int((np.abs(winding) > least).sum()) for least in (INSIDE, 0.5, OUTSIDE))
+    return inside < ENCLOSED[0] * maybe and bool(more * cell < ENCLOSED[1] * hull.volume)
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:

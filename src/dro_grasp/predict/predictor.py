@@ -289,7 +289,6 @@ class _Asking:
         self.config, self.n_points = predictor.config, predictor.network.config.n_hand
         self.problem, self.request, self.finishing = problem, request, _finishing(self.config.finish, request)
         self.done: Finished | None = None
-        self.alone = False
         rescue = self.config.rescue
         most = self.config.retry.rounds + max(len(rescue.trusted_scores), len(rescue.trusted_in_surroundings))
         self.seeds = iter(_drawn(request.seed, most))
@@ -302,7 +301,6 @@ class _Asking:
         for source in (first, rescue):
             if source is not None and not source.knows(hand):
                 raise OptionError(f"source '{source.name}' does not know hand '{hand.name}'; choose another source")
-        self.alone = first is None or rescue is None
         if first is not None:
             yield from self.until_enough(first)
         if rescue is not None:
@@ -329,7 +327,7 @@ class _Asking:
         """Why there are fewer grasps so far than were asked for; None if there are as many."""
         if self.done is not None and len(self.done.rows) == self.request.num:
             return None
-        return shortage_in_words(self.problem, self.request.num, self.done, self.alone)
+        return shortage_in_words(self.problem, self.request.num, self.done, self.request.source != AUTO)
 
     def until_enough(self, source: Source) -> Iterator[_Ask]:
         """Candidates until enough are trusted, or as many as were asked for are admitted, as long as that is in sight."""

@@ -14,6 +14,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.scenery import Scene
 from dro_grasp.predict.admission import PLANE, dropped_in_words
 from dro_grasp.predict.finish import Finished
 from dro_grasp.predict.problem import GraspProblem
@@ -44,7 +45,7 @@ def shortage_in_words(problem: GraspProblem, asked: int, done: Finished | None, 
         problem: With its constraints.
         asked: Grasps that were asked for.
         done: What there is; None for nothing.
-        alone: Whether one source alone made the candidates.
+        alone: Whether one source alone was asked for.
     """
     tally = Tally() if done is None else Tally(
         int(done.trusted.sum()), done.made, done.dropped, done.doubted, done.config.least_confidence)
@@ -98,7 +99,7 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
         "table": f"lower table (now {_short(constraints.table)} m; the object spans z = {low:.3f} to {high:.3f} m)",
         "max_tilt": f"widen max_tilt (now {_short(constraints.max_tilt)} rad)",
         "direction": "leave out direction, or give another one",
-        "obstacles": "check that obstacles is in the object's frame, and leave out what may be touched",
+        "obstacles": _room(constraints.obstacles),
         "contact_region": "enlarge the balls of contact_region",
         "keep_out": "make the balls of keep_out smaller",
         "pregrasp_clearance": f"ask for less pregrasp_clearance (now {_short(constraints.pregrasp_clearance)} m)",
@@ -108,6 +109,13 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
     if constraints.table is None and dropped.get(PLANE):
         given.append("state the table's height if it is lower than the one found in the cloud")
     return given
+
+
+def _room(obstacles: Scene | None) -> str:
+    """What gives room among obstacles: those that were given may lie elsewhere, those of the object's scene do not."""
+    given = obstacles is not None and any(part.sight is not None or part.faces is not None for part in obstacles.parts)
+    return ("check that obstacles is in the object's frame, and leave out what may be touched" if given else
+            "make room around the object, or check in a picture of its scene that nothing of it counts as an obstacle")
 
 
 def _short(value: float | None) -> str:

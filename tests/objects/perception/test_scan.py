@@ -138,6 +138,19 @@ def test_depths_in_other_units_are_refused_with_all_that_they_may_be(median: flo
     assert told.count("divide by") == sum("divide by" in unit for unit in units)
 
 
+@pytest.mark.parametrize(("median", "told"), [
+    (0.0008, "times 1000 it is 0.8 m; times 10000 it is 8 m"), (8e-7, "times 1000000 it is 0.8 m"),
+    (0.029, "times 100 it is 2.9 m"), (1e-12, "nearer than a depth camera measures (0.03 m). Give metres"),
+    (0.031, None), (0.08, None)])
+def test_depths_nearer_than_a_camera_measures_are_refused(median: float, told: str | None) -> None:
+    if told is None:
+        assert depth_points(np.full(SHAPE, median), INTRINSICS)[0, 2] == pytest.approx(median)
+        return
+    with pytest.raises(ObjectError) as caught:
+        depth_points(np.full(SHAPE, median), INTRINSICS)
+    assert told in str(caught.value)
+
+
 def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:
     part = depth[10:80, 60:150]
     matrix = INTRINSICS - np.array([[0, 0, 60.0], [0, 0, 10], [0, 0, 0]])

@@ -15,10 +15,12 @@ import torch
 import trimesh
 from PIL import Image
 
+from dro_grasp.cli.remote import sent_camera
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.frames import read_motion
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import scanned_object
-from dro_grasp.objects.perception.scene_files import SceneCamera
+from dro_grasp.objects.perception.scene_files import SceneCamera, as_camera
 from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.pictures.scene import draw_scene
@@ -285,3 +287,24 @@ def test_the_picture_shows_object_table_and_obstacles(tmp_path: Path) -> None:
     assert (red > blue + 60).sum() > 300  # orange
     assert (blue > red + 60).sum() > 300  # blue
     assert ((np.abs(red - blue) < 25) & (red < 230)).sum() > 5000  # grey
+
+
+@pytest.mark.parametrize(("entry", "told"), [
+    ("depth_scale", "Call it 'depth_unit'"), ("Intrinsics", "Call it 'intrinsics'"), ("D", "Leave it out")])
+def test_entries_of_a_camera_that_nothing_reads_are_refused(entry: str, told: str, tmp_path: Path) -> None:
+    path = _saved(make_scene("table", 1, 0, width=160), tmp_path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {entry: 0.00025}))
+    for read in (as_camera, lambda p: read_motion(p, "T_frame_camera"), sent_camera):
+        with pytest.raises(OptionError, match=f"has an entry '{entry}'.*known are frame, T_frame_camera, intrinsics.*{told}"):
+            read(path)
+
+
+def test_scenes_of_a_millimetre_are_refused(tmp_path: Path) -> None:
+    made = make_scene("table", 1, 0, width=160)
+    depth, camera = np.where(made.depth < 5, made.depth, np.nan), _saved(made, tmp_path)
+    Image.fromarray(np.nan_to_num(1000 * depth).round().astype(np.uint16)).save(tmp_path / "d.png")
+    for given, by in ((tmp_path / "d.png", camera), (made.load().sight.points, camera)):  # type: ignore[union-attr]
+        with pytest.raises(ObjectError, match=r"nearer than a depth camera .*; times 1000 it is .* leave out a scale"):
+            load_scene(given, camera=by, scale=0.001)
+    with pytest.raises(ObjectError, match=r"the cloud of the scene measures .* mm, too little for a hand to meet"):
+        load_scene(made.load().sight.points, scale=0.001)  # type: ignore[union-attr]

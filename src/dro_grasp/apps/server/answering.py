@@ -126,8 +126,7 @@ class Answerer:
     ) -> GenerateAnswer:
         """What `dro-grasp generate` tells and saves of the pair."""
         hand, obj = problem.hand, problem.obj
-        if call.only_successful:
-            require_trial(obj, call.protocol)
+        require_trial(obj, call.protocol, call.only_successful)
         if not obj.is_cloud:
             obj.cut(progress)
         made = self.predictor.run(problem, request, progress)

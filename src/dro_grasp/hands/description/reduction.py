@@ -36,9 +36,10 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
-    HandError: nothing moves, or a joint within the hand is free.
+    HandError: nothing moves, a joint within the hand is free, or one follows itself.
     """
     notes: list[Note] = []
+    _refuse_self_ties(spec, path)
     hand = _largest_tree(spec, path)
     named = _name_everything(spec)
     driven = driven_joints(spec)
@@ -72,6 +73,14 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     _let_visuals_collide(spec, notes)
     kept = {item.name for item in (*spec.bodies, *spec.joints)}
     return (*notes, *(note for note in named if note.subject in kept))
+
+
+def _refuse_self_ties(spec: mujoco.MjSpec, path: Path) -> None:
+    """Refuse a joint that follows itself, by a HandError; longer cycles are refused when the tree is built."""
+    for tie in spec.equalities:
+        if tie.type == mujoco.mjtEq.mjEQ_JOINT and tie.active and tie.name1 == tie.name2:
+            raise HandError(f"{path}: joint '{tie.name1}' follows itself, so nothing says where it is; name the joint that it "
+                            "follows in its <mimic> or <equality>, or remove that if it moves by itself")
 
 
 def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:

@@ -37,6 +37,9 @@ RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
 DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
+NEAREST = 0.03
+"""Least median depth of a camera's image [m] (ours): depth cameras for close objects measure from 7 cm on, others from 10 to 50
+cm; half of the former leaves room for special ones."""
 LEAST_DEPTH = 0.01  # Depth of a point that a camera sees, as a share of the mean depth [1] (ours)
 FACING = 0.9  # Share of a camera's normals that face it [1] (ours)
 NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
@@ -111,8 +114,17 @@ def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int,
 
 
 def check_depths(median: float) -> None:
-    """Refuse depths whose median is too far for metres, by an ObjectError that names their likely unit."""
+    """Refuse depths whose median [m] is too far or too near for a camera, by an ObjectError that names their likely unit.
+
+    A camera measures nothing nearer than some centimetres: such depths were divided by 1000 twice, or are in a larger unit.
+    """
     least, most = DEPTHS
+    if 0 < median < NEAREST:
+        found = {1 / size: median / size for size in DEPTH_UNITS.values() if least <= median / size <= most}
+        told = "".join(f"; times {factor:.0f} it is {depth:.3g} m" for factor, depth in found.items())
+        raise ObjectError(f"the median depth is {median:.3g} m, nearer than a depth camera measures ({NEAREST:g} m){told}. "
+                          "Give metres: whole numbers in an image count as millimetres already, so leave out a scale, or "
+                          "correct the camera's depth_unit")
     if median <= most:
         return
     found = {unit: size for unit, size in DEPTH_UNITS.items() if least <= median * size <= most}

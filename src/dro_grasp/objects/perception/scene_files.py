@@ -15,6 +15,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.files import given_path, reading
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
+from dro_grasp.objects.loading import SMALLEST
 from dro_grasp.objects.perception.choosing import Sight
 from dro_grasp.objects.perception.scan import check_depths, check_intrinsics
 from dro_grasp.objects.reading import numbers, read_cloud, returned
@@ -48,7 +49,10 @@ class SceneCamera:
 
 
 def as_camera(camera: SceneCamera | Path | str) -> SceneCamera:
-    """A camera, or the one of a JSON file `{"frame", "T_frame_camera", "intrinsics", "depth_unit"}`, the last two optional."""
+    """A camera, or the one of a JSON file `{"frame", "T_frame_camera", "intrinsics", "depth_unit"}`, the last two optional.
+
+    OptionError: the file cannot be read, or holds something else.
+    """
     if isinstance(camera, SceneCamera):
         return camera
     path, motion = given_path(camera), read_motion(Path(camera), "T_frame_camera")
@@ -126,7 +130,12 @@ def sight_of_depth(depth: Num[np.ndarray, "..."], camera: SceneCamera | None, sc
 
 
 def sight_of_cloud(points: Float[np.ndarray, "n 3"], camera: SceneCamera | None, shape: tuple[int, int] | None) -> Sight:
-    """The points of a cloud; an organised one has pixels."""
+    """The points of a cloud [m]; an organised one has pixels. ObjectError: it is not in metres."""
     kept = np.flatnonzero(returned(points))
+    if len(kept) and camera is not None:
+        check_depths(float(np.median(points[kept, 2])))
+    elif len(kept) and 0 < (extent := float(np.ptp(points[kept], axis=0).max())) < SMALLEST:
+        raise ObjectError(f"the cloud of the scene measures {extent * 1000:.3g} mm, too little for a hand to meet; "
+                          "give metres, or another scale")
     T = np.eye(4) if camera is None else camera.T_frame_camera
     return Sight(points[kept], T, camera is not None, kept, shape, None if camera is None else camera.intrinsics)
