@@ -85,8 +85,8 @@ def test_bad_urdf_is_refused(tmp_path: Path, text: str, told: str) -> None:
         ('<mujoco><asset><mesh name="m" file="m.stl"/></asset><worldbody><body><joint/><geom type="mesh" mesh="m"/></body>'
          "</worldbody></mujoco>", "m.stl"),
         ('<mujoco><worldbody><body><hinge/></body></worldbody></mujoco>', "hinge"),
-        ('<mujoco><worldbody><body><geom size="0.05"/><body><joint name="j" axis="1 0 0" range="0 1"/><geom size="0.05"/></body>'
-         '</body></worldbody><equality><joint joint1="j" joint2="j"/></equality></mujoco>', "joint 'j' follows itself"),
+        ('<mujoco><worldbody><body><geom size="0.05"/><body><joint name="j" axis="1 0 0" range="0 1"/><geom size="0.05"/>'
+         '</body></body></worldbody><equality><joint joint1="j" joint2="j"/></equality></mujoco>', "joint 'j' follows itself"),
     ],
 )
 def test_bad_mjcf_is_refused(tmp_path: Path, text: str, told: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from dro_grasp.cli.given_scene import check_choice, find_on_table
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, load_obstacle, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -112,7 +112,6 @@ class Plan:
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output
-        from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
         from dro_grasp.objects.shape import with_mass
         from dro_grasp.predict.predictor import GraspPredictor
@@ -136,7 +135,7 @@ class Plan:
         if self.efforts and self.trajectory is None:
             raise OptionError("--efforts are written into the trajectory file; name one with --trajectory YAML")
         robot = load_robot(self.robot)
-        obstacles = [load_object(name) for name in self.obstacles]
+        obstacles = [load_obstacle(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
         if self.mass is not None:

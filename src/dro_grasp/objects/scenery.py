@@ -223,8 +223,8 @@ def load_scene(
     if isinstance(source, str | Path):
         path = given_path(source)
         if not path.is_file():
-            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD), or what "
-                              "a camera saw (also PNG, TIFF)")
+            raise ObjectError(f"no file at {path}; give what a camera saw of the scene (NPY, PLY, PCD, PNG, TIFF), or the mesh "
+                              "or cloud of what is to be avoided (also STL, OBJ)")
         label, origin = name or path.stem, str(path)
         if is_depth(path):
             return _seen(label, sight_of_depth(read_depth(path, seen_by), seen_by, scale, origin))

@@ -313,8 +313,8 @@ def _side_of_box(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], b
         if len(edge) and -BACK - JOINED < top < JOINED:
             ends = own[height[own] > top - JOINED]
             if float((KDTree(sight.points[edge]).query(sight.points[ends])[0] < JOINED).mean()) > ALONG:
-                return ("it ends at a level face that counts as a table of its own, so it may be one side of a large box, and not "
-                        "all of it. If so, give the pixels of all of the box (mask=PNG)",)
+                return ("it ends at a level face that counts as a table of its own, so it may be one side of a large box, and "
+                        "not all of it. If so, give the pixels of all of the box (mask=PNG)",)
     return ()
 
 
