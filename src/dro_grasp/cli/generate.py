@@ -193,8 +193,8 @@ class Generate:
             raise OptionError(f"{option} asks for a trial in simulation, and {what} is a bare point cloud, which gets none; "
                               f"leave {option} out, or give the object's mesh with --object")
         if self.only_successful and self.protocol == "none":
-            raise OptionError("--only-successful saves what passed a trial, and --protocol none asks for none; leave one of "
-                              "them out")
+            raise OptionError("--only-successful saves what passed a trial, and --protocol none asks for none; name a "
+                              "--protocol, or leave --only-successful out")
         if self.view:
             require_extra("apps")
 

@@ -45,7 +45,7 @@ def _switch(found: re.Match[str]) -> str:
 
 def _names(command: Any) -> Iterator[str]:
     """Names of a command's options, those of its groups included."""
-    for field in fields(command):
+    for field in fields(command) if is_dataclass(command) else ():
         yield field.name
         if is_dataclass(group := getattr(command, field.name)):
             yield from _names(group)
