@@ -19,7 +19,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import FARTHEST, check_scale
+from dro_grasp.objects.loading import FARTHEST, SMALLEST, check_scale
 from dro_grasp.objects.perception.choosing import Chosen, Pixel, Sight, Spot, choose
 from dro_grasp.objects.perception.scene_files import (
     SceneCamera,
@@ -237,8 +237,18 @@ def load_scene(
         if seen_by is not None:
             raise ObjectError(f"{origin} is a mesh, and no camera sees one; give its cloud or depth image, or leave out the "
                               "camera")
-        return _of_mesh(label, geometry, origin, scale * unit)
-    return _seen(label, sight_of_cloud(coordinates(geometry, origin) * (scale * unit), seen_by, _shape(geometry)), origin)
+        return _scaled(_of_mesh(label, geometry, origin, scale * unit), scale, origin)
+    seen = _seen(label, sight_of_cloud(coordinates(geometry, origin) * (scale * unit), seen_by, _shape(geometry)), origin)
+    return _scaled(seen, scale, origin)
+
+
+def _scaled(scene: Scene, scale: float, origin: str) -> Scene:
+    """The scene, unless a scale below 1 makes it a speck: ObjectError."""
+    extent = float(np.ptp(scene.points, axis=0).max())
+    if scale < 1 and extent < SMALLEST:
+        raise ObjectError(f"{origin} measures {extent * 1000:.3g} mm when it is scaled by {scale:g}, too little for a hand to "
+                          "meet; give another scale, or leave it out")
+    return scene
 
 
 def _shape(cloud: Any) -> tuple[int, int] | None:

@@ -306,5 +306,7 @@ def test_scenes_of_a_millimetre_are_refused(tmp_path: Path) -> None:
     for given, by in ((tmp_path / "d.png", camera), (made.load().sight.points, camera)):  # type: ignore[union-attr]
         with pytest.raises(ObjectError, match=r"nearer than a depth camera .*; times 1000 it is .* leave out a scale"):
             load_scene(given, camera=by, scale=0.001)
-    with pytest.raises(ObjectError, match=r"the cloud of the scene measures .* mm, too little for a hand to meet"):
-        load_scene(made.load().sight.points, scale=0.001)  # type: ignore[union-attr]
+    for source in (made.load().sight.points, trimesh.creation.box((0.5, 0.3, 0.4))):  # type: ignore[union-attr]
+        with pytest.raises(ObjectError, match=r"measures .* mm when it is scaled by 0\.001, too little for a hand to meet"):
+            load_scene(source, scale=0.001)
+    assert np.ptp(load_scene(np.array([[0.1, 0, 0], [0.102, 0, 0]])).points) > 0, "a speck in metres is one"

@@ -15,7 +15,6 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.files import given_path, reading
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
-from dro_grasp.objects.loading import SMALLEST
 from dro_grasp.objects.perception.choosing import Sight
 from dro_grasp.objects.perception.scan import check_depths, check_intrinsics
 from dro_grasp.objects.reading import numbers, read_cloud, returned
@@ -134,8 +133,5 @@ def sight_of_cloud(points: Float[np.ndarray, "n 3"], camera: SceneCamera | None,
     kept = np.flatnonzero(returned(points))
     if len(kept) and camera is not None:
         check_depths(float(np.median(points[kept, 2])))
-    elif len(kept) and 0 < (extent := float(np.ptp(points[kept], axis=0).max())) < SMALLEST:
-        raise ObjectError(f"the cloud of the scene measures {extent * 1000:.3g} mm, too little for a hand to meet; "
-                          "give metres, or another scale")
     T = np.eye(4) if camera is None else camera.T_frame_camera
     return Sight(points[kept], T, camera is not None, kept, shape, None if camera is None else camera.intrinsics)
