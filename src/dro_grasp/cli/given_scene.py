@@ -59,14 +59,22 @@ def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
 def find_on_table(scene: Scene, robot: Robot, command: Plan) -> PickedObject:
     """The thing on a robot's table that is meant, flat or not; the picture is drawn in either case."""
     from dro_grasp.arm.tabletop.table_scene import as_picked, picked_flat
+    from dro_grasp.errors import ObjectError
     from dro_grasp.objects.perception.choosing import all_within
     from dro_grasp.pictures.scene import draw_scene
 
-    flat = None if command.mask is None else picked_flat(scene, robot, command.mask)
+    picture = command.scene_picture
+    try:
+        flat = None if command.mask is None else picked_flat(scene, robot, command.mask)
+    except ObjectError:
+        if picture is not None and scene.sight is not None:
+            draw_scene(scene, None, picture)
+            say_aside(f"what the scene shows: {picture}")
+        raise
     if flat is None:
-        return as_picked(find_thing(scene, command), robot)
-    if command.scene_picture is not None:
+        return as_picked(find_thing(scene, command), robot, scene)
+    if picture is not None:
         assert scene.sight is not None
-        draw_scene(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), command.scene_picture)
-        say_aside(TAKEN.format(command.scene_picture))
+        draw_scene(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), picture)
+        say_aside(TAKEN.format(picture))
     return flat

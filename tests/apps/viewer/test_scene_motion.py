@@ -213,9 +213,9 @@ def test_a_thing_on_another_surface_has_that_one_as_an_obstacle(scene: Scene, ro
     assert high.obstacles is not None
     board = np.abs(around.points[:, 2] - 0.2) < 0.005
     assert board.sum() > 100 + (np.abs(high.obstacles.points[:, 2] - 0.2) < 0.005).sum()
-    assert levelled(robot, high.obj) is robot
+    assert levelled(robot, high.obj, scene) is robot
     raised = replace(low.obj, table=np.array([0.0, 0.0, 1.0, 0.02]))
-    table = levelled(robot, raised).table
+    table = levelled(robot, raised, scene).table
     assert table is not None
     assert table.height == pytest.approx(0.02)
     assert (table.centre, table.size) == (robot.table.centre, robot.table.size)

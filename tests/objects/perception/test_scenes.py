@@ -21,6 +21,7 @@ from dro_grasp.frames import read_motion
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.scan import scanned_object
 from dro_grasp.objects.perception.scene_files import SceneCamera, as_camera
+from dro_grasp.objects.perception.segmentation import STRUCTURE
 from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.pictures.scene import draw_scene
@@ -205,9 +206,43 @@ def test_the_side_of_a_large_box_is_told() -> None:
 
 def test_a_mask_says_that_a_level_face_is_of_the_object() -> None:
     made = _large_box()
-    chosen = made.load().chosen(mask=made.owner == 0)
+    scene = made.load()
+    chosen = scene.chosen(mask=made.owner == 0)
     assert overlap(made, 0, chosen.pixels) > WELL
     assert not any("large box" in note for note in chosen.notes)
+    found = scene.object_at(mask=made.owner == 0)
+    assert found.obj.table is not None
+    assert abs(found.obj.table[3]) < 0.01, "it stands on the table, not on its lid"
+
+
+def test_a_large_box_from_straight_above_stands_on_the_table() -> None:
+    depth = np.full((240, 320), 1.1)
+    depth[60:180, 90:210] = 0.95
+    camera = SceneCamera(np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.1], [0, 0, 0, 1]]),
+                         np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), "world")
+    found = load_scene(depth, camera=camera).object_at(mask=depth < 1)
+    assert found.obj.table is not None
+    np.testing.assert_allclose(found.obj.table, (0, 0, 1, 0), atol=0.01)
+    assert found.obj.cloud[:, 2].max() == pytest.approx(0.15, abs=0.01)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.8, 1.0])
+def test_a_loose_mask_takes_no_table(share: float) -> None:
+    """A rectangle around the only thing, and much of its table."""
+    made = make_scene("table", 1, 0, width=320)
+    v, u = (int(np.median(rows)) for rows in np.nonzero(made.owner == 0))
+    mask = np.zeros(made.owner.shape, bool)
+    half = [int(share * n) for n in mask.shape]
+    mask[max(0, v - half[0]):v + half[0], max(0, u - half[1]):u + half[1]] = True
+    assert mask.mean() > 0.5
+    scene = made.load()
+    chosen = scene.chosen(mask=mask)
+    assert overlap(made, 0, chosen.pixels) > WELL
+    assert scene.sight is not None
+    table = np.zeros(mask.size, bool)
+    table[scene.sight.pixels[scene.segments.labels == STRUCTURE]] = True
+    with pytest.raises(ObjectError, match="points that stand out of tables"):
+        scene.chosen(mask=mask & table.reshape(mask.shape))
 
 
 def test_what_a_mask_shows_beside_its_thing_is_told() -> None:

@@ -17,7 +17,7 @@ from dro_grasp.apps.viewer.film import RATE, Film
 from dro_grasp.apps.viewer.robot_view import RobotView
 from dro_grasp.apps.viewer.scene_cloud import POINT, shades
 from dro_grasp.apps.viewer.scene_page import STRUCTURE_THERE, Offer, ScenePage, Wish
-from dro_grasp.apps.viewer.scene_view import Client, move, rgb
+from dro_grasp.apps.viewer.scene_view import Client, escaped, move, rgb
 from dro_grasp.arm.planning.candidates import predicted
 from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.planning.placing import Place, foot, height_below
@@ -25,6 +25,7 @@ from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.task import PlanConfig, Task
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.animation import VIEW
+from dro_grasp.arm.tabletop.table_scene import refuse_sunk, table_note
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
@@ -127,7 +128,7 @@ class RobotScenePage(ScenePage):
         cloud = self.cloud
         flat = cloud.world[cloud.labels == STRUCTURE]
         near = flat[np.hypot(flat[:, 0] - x, flat[:, 1] - y) < ON_PLANE]
-        if self.offer is not None and (table := levelled(self.robot, self.offer.found.obj).table) is not None and (
+        if self.offer is not None and (table := levelled(self.robot, self.offer.found.obj, cloud.scene).table) is not None and (
             not len(near) or abs(float(np.median(near[:, 2])) - table.height) < ON_PLANE):
             return table.height
         return float(np.median(near[:, 2])) if len(near) else 0.0
@@ -190,13 +191,17 @@ class RobotScenePage(ScenePage):
         return Offer(wish, found, grasps[order], tuple(faults[i] for i in order), shortage)
 
     def _task(self, wish: Wish, found: FoundObject, spot: tuple[float, ...] | None) -> Task:
-        place = None if spot is None else Place.of(spot)
-        return Task.of(levelled(self.robot, found.obj), found.obj, np.eye(4), (), self._config(wish, found), wish.seed,
-                       place=place)
+        place, robot = None if spot is None else Place.of(spot), levelled(self.robot, found.obj, wish.cloud.scene)
+        return Task.of(robot, found.obj, np.eye(4), (), self._config(wish, found), wish.seed, place=place)
 
     def _config(self, wish: Wish, found: FoundObject) -> PlanConfig:
         around = surroundings(wish.cloud.scene, found, self.robot)
         return PlanConfig(int(self.num.value), constraints=Constraints(obstacles=around))
+
+    def _notes(self, wish: Wish, found: FoundObject) -> str:
+        table = levelled(self.robot, found.obj, wish.cloud.scene).table
+        told = () if table is None else table_note(self.robot, table.height)
+        return "  \n".join([super()._notes(wish, found), *(f"⚠ {escaped(note)}." for note in told)])
 
     def _present(self, offer: Offer) -> None:
         super()._present(offer)
@@ -308,11 +313,15 @@ class RobotScenePage(ScenePage):
         self._say("plan.npz: `dro-grasp view plan.npz` plays it.")
 
 
-def levelled(robot: Robot, obj: ObjectModel) -> Robot:
-    """The robot with its table at the height that was seen below an object, if that is its table."""
+def levelled(robot: Robot, obj: ObjectModel, scene: Scene) -> Robot:
+    """The robot with its table at the height that was seen below an object of a scene, if that is its table.
+
+    ObjectError: hands would go through the table that the robot file states.
+    """
     height = height_below(obj)
     if robot.table is None or height is None or abs(height - robot.table.height) > TABLE_WITHIN:
         return robot
+    refuse_sunk(robot, height, scene)
     return replace(robot, table=replace(robot.table, height=height))
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.arm.flat.things import overhang, seen_flat
-from dro_grasp.arm.planning.placing import LEVEL
+from dro_grasp.arm.planning.placing import LEVEL, height_below
 from dro_grasp.arm.planning.workcell import VOXEL
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.geometry.cache import content_hash
+from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.kinds import checked
 from dro_grasp.objects.perception.choosing import Pixel, Spot, within
 from dro_grasp.objects.scenery import FoundObject, Scene
@@ -21,7 +22,7 @@ from dro_grasp.objects.shape import ObjectModel
 
 OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
 APART = 0.015  # Difference between a table's seen and stated height that is told [m] (ours)
-SUNK = 0.03  # Depth below its stated height at which no table can be [m] (ours)
+SUNK = 0.03  # Depth below its stated height from which what is seen is no table, unless that is seen as well [m] (ours)
 BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
 
 
@@ -38,14 +39,8 @@ class PickedObject:
 
     def noted(self, stated: Robot) -> PickedObject:
         """The same, with a note on the object if its table is elsewhere than the robot's is stated to be."""
-        there, given = self.robot.table, stated.table
-        if there is None or given is None or abs(there.height - given.height) < APART:
-            return self
-        way = 100 * (there.height - given.height)
-        note = (f"it stands on a level plane {abs(way):.1f} cm {'above' if way > 0 else 'below'} the table of robot "
-                f"'{stated.name}', and that plane counts as the table. If it stands on the table itself, correct the camera's "
-                "pose, or the table's `height` in the robot file")
-        return replace(self, obj=replace(self.obj, notes=(*self.obj.notes, note)))
+        note = () if self.robot.table is None else table_note(stated, self.robot.table.height)
+        return replace(self, obj=replace(self.obj, notes=(*self.obj.notes, *note))) if note else self
 
 
 @checked
@@ -80,14 +75,14 @@ def pick_object(
     seen = seen_on_table(scene, robot)
     if mask is not None and (flat := picked_flat(seen, robot, mask, name)) is not None:
         return flat
-    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name), robot)
+    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name), robot, seen)
 
 
-def as_picked(found: FoundObject, robot: Robot) -> PickedObject:
-    """An object that was found on a robot's table; see `pick_object`."""
-    level = at_seen_height(robot, found.obj)
-    assert level.table is not None
+def as_picked(found: FoundObject, robot: Robot, scene: Scene) -> PickedObject:
+    """An object that was found in a scene on a robot's table; see `pick_object`."""
     others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
+    level = at_seen_height(robot, found.obj, scene)
+    assert level.table is not None
     return PickedObject(found.obj, _solid(others, level.table.height), level).noted(robot)
 
 
@@ -99,7 +94,8 @@ def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) 
     flat = seen_flat(name or scene.name, sight.world(), within(scene.name, sight, mask), table, sight.T[:3, 3])
     if flat is None:
         return None
-    return PickedObject(flat.obj, flat.others, _with_table_at(robot, table, flat.table)).noted(robot)
+    refuse_sunk(robot, flat.table, scene)
+    return PickedObject(flat.obj, flat.others, replace(robot, table=replace(table, height=flat.table))).noted(robot)
 
 
 def seen_on_table(scene: Scene, robot: Robot) -> Scene:
@@ -121,28 +117,47 @@ def seen_on_table(scene: Scene, robot: Robot) -> Scene:
     return scene if kept.all() else scene.of(kept)
 
 
-def at_seen_height(robot: Robot, obj: ObjectModel) -> Robot:
-    """The robot with its table at the height of the plane on which an object in the world stands.
+def at_seen_height(robot: Robot, obj: ObjectModel, scene: Scene | None = None) -> Robot:
+    """The robot with its table at the height of the plane on which an object in the world stands, below its middle.
 
     Raises:
-        ObjectError: There is no such plane, it is not level, or it is below the table that the robot file states.
+        ObjectError: There is no such plane, it is not level, or it is below the table that the robot file states, which the
+            scene does not show there.
         RobotError: The robot has no table.
     """
-    table, plane = _table(robot, obj.name), obj.table
-    if plane is None or plane[2] < LEVEL:
+    table, plane, height = _table(robot, obj.name), obj.table, height_below(obj)
+    if plane is None or height is None:
         tilt = "" if plane is None else f": the plane is tilted by {np.degrees(np.arccos(plane[2])):.0f} degrees"
         raise ObjectError(f"the camera sees no level table below '{obj.name}'{tilt}; correct its pose in the robot file, or "
                           "the table's place")
-    height = float((plane[3] - plane[:2] @ np.array(table.centre)) / plane[2])
-    return _with_table_at(robot, table, height)
-
-
-def _with_table_at(robot: Robot, table: Table, height: float) -> Robot:
-    """The robot with its table at this height [m], to which hands go down."""
-    if height < table.height - SUNK:
-        raise ObjectError(f"the camera sees the table of robot '{robot.name}' at z = {height:.3f} m, and its file states "
-                          f"{table.height:.3f} m: hands would go through it. Correct the camera's pose, or its `height`")
+    refuse_sunk(robot, height, scene)
     return replace(robot, table=replace(table, height=height))
+
+
+def refuse_sunk(robot: Robot, height: float, scene: Scene | None = None) -> None:
+    """Refuse a plane below the table that a robot file states [m], through which hands would go, by an ObjectError.
+
+    What is lower than the table is another surface where the scene shows the table at its height.
+    """
+    if (table := robot.table) is None or height >= table.height - SUNK:
+        return
+    if scene is not None and scene.sight is not None:
+        planes = [moved_plane(plane, scene.sight.T) for plane in scene.segments.planes]
+        levels = [(plane[3] - plane[:2] @ np.array(table.centre)) / plane[2] for plane in planes if abs(plane[2]) > LEVEL]
+        if any(abs(level - table.height) < APART for level in levels):
+            return
+    raise ObjectError(f"the table is seen at z = {height:.3f} m, and the file of robot '{robot.name}' states "
+                      f"{table.height:.3f} m: hands would go through it. Correct the pose of the camera or of the object, or "
+                      "the `height` of the table in the robot file")
+
+
+def table_note(robot: Robot, height: float) -> tuple[str, ...]:
+    """A note where an object stands on a plane at another height than the table that the robot file states [m]."""
+    if robot.table is None or abs(way := height - robot.table.height) < APART:
+        return ()
+    return (f"it stands on a level plane {100 * abs(way):.1f} cm {'above' if way > 0 else 'below'} the table of robot "
+            f"'{robot.name}', and that plane counts as the table. If it stands on the table itself, correct the pose of the "
+            "camera, or the table's `height` in the robot file",)
 
 
 def _table(robot: Robot, name: str) -> Table:

@@ -29,7 +29,6 @@ ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m
 PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
 LEAST_MASK = 60  # Fewest points in a mask (ours)
 COVERED = 0.5  # Share of a plane's points in a mask from which the plane is a face of the object [1] (ours)
-EVERYTHING = 0.9  # Share of all points in a mask from which it says nothing of planes [1] (ours)
 SECOND = 0.5  # Share of another thing's points in a mask from which it is told that the thing is left out [1] (ours)
 JOINED = 0.015  # Distance of a thing's top from the edge of a level face up to which it ends there [m] (ours)
 ALONG = 0.5  # Share of its top at such an edge from which it may be a side of a box [1] (ours)
@@ -127,8 +126,8 @@ def _touching(segments: Segments, number: int, mine: Bool[np.ndarray, " n"], par
     if divided:
         return ("it may be two things that touch: its surface turns inward along a seam, or breaks off at a gap, and both "
                 "sides count as one. If so, mean the side that you point at (part=True), or give its pixels (mask=PNG)",)
-    return ("it may be two things that touch, one on the other or in it: its surface turns inward along a seam, and both count "
-            "as one. If so, give the pixels of the one that you mean (mask=PNG)",)
+    return ("it may be two things that touch, one on the other or in it: its surface turns inward along a seam, or breaks off "
+            "at a gap, and both count as one. If so, give the pixels of the one that you mean (mask=PNG)",)
 
 
 def _beside(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
@@ -255,7 +254,9 @@ def all_within(name: str, sight: Sight, segments: Segments, mask: Any) -> Chosen
 
 def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
     inside = within(name, sight, mask)
-    own = np.flatnonzero(inside & ((segments.labels != STRUCTURE) | _faces(sight, segments, inside)))
+    plane = _plane_of(sight, segments)
+    faces = _faces(sight, segments, plane, inside)
+    own = np.flatnonzero(inside & ((plane < 0) | faces[plane]))
     if len(own) < LEAST_MASK:
         raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
                           f"needed; give one that is true on the object. '{name}' shows {listed(sight, segments)}")
@@ -264,21 +265,46 @@ def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.nd
     if (labels >= 0).any():
         most = np.bincount(labels[labels >= 0]).argmax()
         near = KDTree(sight.points[own[labels == most]]).query(sight.points[own])[0] < BESIDE
-        own = own[near | (labels == STRUCTURE)]
+        beside = np.bincount(plane[own[near & (labels == STRUCTURE)]], minlength=len(faces)) > 0
+        own = own[near | ((labels == STRUCTURE) & beside[plane[own]])]
     return own
 
 
-def _faces(sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Points of planes that lie within a mask for the most part: faces of the object, and no table or wall."""
-    faces = np.zeros(len(inside), bool)
+def _plane_of(sight: Sight, segments: Segments) -> Int[np.ndarray, " n"]:
+    """The plane of each point of a table, board or wall; -1 for all others."""
+    number = np.full(len(segments.labels), -1)
     rows = np.flatnonzero(segments.labels == STRUCTURE)
-    if not len(rows) or not segments.planes or inside.mean() > EVERYTHING:
-        return faces
-    planes = np.array(segments.planes)
-    plane = np.abs(sight.points[rows] @ planes[:, :3].T - planes[:, 3]).argmin(1)
-    covered = np.bincount(plane, inside[rows], len(planes)) > COVERED * np.bincount(plane, minlength=len(planes))
-    faces[rows] = covered[plane]
+    if len(rows) and segments.planes:
+        planes = np.array(segments.planes)
+        number[rows] = np.abs(sight.points[rows] @ planes[:, :3].T - planes[:, 3]).argmin(1)
+    return number
+
+
+def _faces(
+    sight: Sight, segments: Segments, plane: Int[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]
+) -> Bool[np.ndarray, " p"]:
+    """Which planes are faces of an object that is inside a mask, and no tables or walls.
+
+    They are within the mask for the most part. A level one has another below it, which is not; an upright one stands on such a
+    plane.
+    """
+    planes, covered = segments.planes, _covered(segments, plane, inside)
+    faces = np.zeros(len(planes) + 1, bool)  # the last for points of no plane
+    for k in np.flatnonzero(covered):
+        middle = sight.points[plane == k].mean(0)
+        for j in np.flatnonzero(~covered):
+            cosine, height = float(planes[j][:3] @ planes[k][:3]), float(planes[j][:3] @ middle - planes[j][3])
+            faces[k] |= height > ON_TABLE and (cosine > 0.9 or abs(cosine) < 0.2)
     return faces
+
+
+def _covered(
+    segments: Segments, plane: Int[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]
+) -> Bool[np.ndarray, " p"]:
+    """Which planes are inside for the most part."""
+    count = len(segments.planes)
+    whole, part = (np.bincount(plane[(plane >= 0) & rows], minlength=count) for rows in (np.ones(len(plane), bool), inside))
+    return part > COVERED * whole
 
 
 def _left_out(
@@ -336,17 +362,22 @@ def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes:
 
 
 def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> int | None:
-    """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one."""
+    """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one.
+
+    A plane that is a face of the thing is none.
+    """
     if not segments.planes:
         return None
-    points = sight.points[own]
+    points, mine = sight.points[own], np.zeros(len(sight.points), bool)
+    mine[own] = True
+    faces = _covered(segments, _plane_of(sight, segments), mine)
     normals = np.array([plane[:3] for plane in segments.planes])
     up = normals[0]
     if sight.from_camera and (level := np.abs(sight.T[2, :3] @ normals.T) > 0.9).any():
         up = normals[level.argmax()]
     # The lowest points, less those that noise puts lower (ours).
     lows = [float(np.quantile(points @ plane[:3] - plane[3], 0.02)) for plane in segments.planes]
-    fits = [(low, i) for i, low in enumerate(lows) if normals[i] @ up > 0.9 and low > -0.02]
+    fits = [(low, i) for i, low in enumerate(lows) if normals[i] @ up > 0.9 and low > -0.02 and not faces[i]]
     return min(fits)[1] if fits else None
 
 
