@@ -19,7 +19,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
-from dro_grasp.objects.loading import FARTHEST, SMALLEST, check_scale
+from dro_grasp.objects.loading import FARTHEST, check_scale
 from dro_grasp.objects.perception.choosing import Chosen, Pixel, Sight, Spot, choose
 from dro_grasp.objects.perception.scene_files import (
     SceneCamera,
@@ -39,6 +39,7 @@ SPACING = 0.005  # Spacing of the grid of distances to a scene [m] (ours)
 LARGEST_GRID = 4_000_000  # Most points of such a grid; a larger one gets a wider spacing (ours)
 MARGIN = 0.03  # Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border
 THIN = 0.004  # Edge of the cubes of which each keeps one point of a cloud [m] (ours): cameras see far more
+SPECK = 0.0025  # Extent of a scene below which its scale is doubted [m] (ours): a room in millimetres that were metres has 3 mm
 TOUCH = 0.003  # Distance to a scene at which a point of an object's surface lies on it [m] (ours)
 
 Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]  # Of places [m]
@@ -245,7 +246,7 @@ def load_scene(
 def _scaled(scene: Scene, scale: float, origin: str) -> Scene:
     """The scene, unless a scale below 1 makes it a speck: ObjectError."""
     extent = float(np.ptp(scene.points, axis=0).max())
-    if scale < 1 and extent < SMALLEST:
+    if scale < 1 and extent < SPECK:
         raise ObjectError(f"{origin} measures {extent * 1000:.3g} mm when it is scaled by {scale:g}, too little for a hand to "
                           "meet; give another scale, or leave it out")
     return scene

@@ -338,10 +338,16 @@ def test_scenes_of_a_millimetre_are_refused(tmp_path: Path) -> None:
     made = make_scene("table", 1, 0, width=160)
     depth, camera = np.where(made.depth < 5, made.depth, np.nan), _saved(made, tmp_path)
     Image.fromarray(np.nan_to_num(1000 * depth).round().astype(np.uint16)).save(tmp_path / "d.png")
-    for given, by in ((tmp_path / "d.png", camera), (made.load().sight.points, camera)):  # type: ignore[union-attr]
-        with pytest.raises(ObjectError, match=r"nearer than a depth camera .*; times 1000 it is .* leave out a scale"):
-            load_scene(given, camera=by, scale=0.001)
-    for source in (made.load().sight.points, trimesh.creation.box((0.5, 0.3, 0.4))):  # type: ignore[union-attr]
+    with pytest.raises(ObjectError, match=r"nearer than a depth camera .*; times 1000 it is .* leave out a scale"):
+        load_scene(tmp_path / "d.png", camera=camera, scale=0.001)
+    sight = made.load().sight
+    assert sight is not None
+    points = sight.points[np.linalg.norm(sight.points, axis=1) < 1.5]
+    with pytest.raises(ObjectError, match=r"are 0\.0\d+ m from the camera, nearer than a depth camera measures"):
+        load_scene(points, camera=camera, scale=0.001)
+    for source in (points, trimesh.creation.box((0.5, 0.3, 0.4))):
         with pytest.raises(ObjectError, match=r"measures .* mm when it is scaled by 0\.001, too little for a hand to meet"):
             load_scene(source, scale=0.001)
+    turned = points[:, [2, 0, 1]]  # x forward: many z are near 0
+    assert load_scene(turned, camera=camera).sight is not None
     assert np.ptp(load_scene(np.array([[0.1, 0, 0], [0.102, 0, 0]])).points) > 0, "a speck in metres is one"

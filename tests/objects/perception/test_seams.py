@@ -5,7 +5,9 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.scenery import load_scene
 from tests.helpers.made_scenes import MadeScene, asked, overlap, render_scene, touching
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # corners [m]
@@ -38,6 +40,17 @@ def test_two_boxes_with_a_gap_between_them_are_two(view: int) -> None:
     if scene.segments.count == 1:
         assert any("breaks off at a gap" in note and "part=True" in note for note in scene.chosen().notes)
     assert min(asked(made, part=True)) > 0.85
+
+
+@pytest.mark.parametrize("spacing", [0.005, 0.0062, 0.007, 0.0074])
+def test_a_thinned_cloud_has_no_gaps(spacing: float) -> None:
+    made = _scene((LOW,), 1)
+    sight = made.load().sight
+    assert sight is not None
+    points = sight.points[one_per_cell(sight.points, spacing)]
+    scene = load_scene(points, camera=made.camera)
+    assert not any(scene.segments.seams)
+    assert not scene.segments.parts.any()
 
 
 def test_the_other_side_is_an_obstacle() -> None:

@@ -16,7 +16,7 @@ from dro_grasp.files import given_path, reading
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
 from dro_grasp.objects.perception.choosing import Sight
-from dro_grasp.objects.perception.scan import check_depths, check_intrinsics
+from dro_grasp.objects.perception.scan import NEAREST, check_depths, check_intrinsics
 from dro_grasp.objects.reading import numbers, read_cloud, returned
 
 IMAGES = {".png", ".tif", ".tiff"}  # Files of depth images, beside NPY
@@ -131,7 +131,8 @@ def sight_of_depth(depth: Num[np.ndarray, "..."], camera: SceneCamera | None, sc
 def sight_of_cloud(points: Float[np.ndarray, "n 3"], camera: SceneCamera | None, shape: tuple[int, int] | None) -> Sight:
     """The points of a cloud [m]; an organised one has pixels. ObjectError: it is not in metres."""
     kept = np.flatnonzero(returned(points))
-    if len(kept) and camera is not None:
-        check_depths(float(np.median(points[kept, 2])))
+    if len(kept) and camera is not None and (away := float(np.median(np.linalg.norm(points[kept], axis=1)))) < NEAREST:
+        raise ObjectError(f"the points of the cloud are {away:.3g} m from the camera, nearer than a depth camera measures "
+                          f"({NEAREST:g} m); give them in metres, in the frame of the camera")
     T = np.eye(4) if camera is None else camera.T_frame_camera
     return Sight(points[kept], T, camera is not None, kept, shape, None if camera is None else camera.intrinsics)

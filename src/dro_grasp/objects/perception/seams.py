@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
-BREAK = 1.5  # Distance of neighbours across a gap, in cubes [1] (ours): those of an even surface are nearer
+BREAK = 1.5  # Distance of neighbours across a gap, in cubes or usual distances [1] (ours): on an even surface they are nearer
 ACROSS = 0.6  # Cosine between a gap and the ray to it below which it is seen across [1] (ours)
 PART = 0.1  # Share of a thing that each side of a seam has, at least [1] (ours)
 LEAST_PART = 24  # Filled cubes of each, at least (ours): as of a thing
@@ -82,7 +82,8 @@ def _sides(surface: Surface, own: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"
     # A camera sees a gap between things across its rays; along them, a surface hides a part of itself.
     rays = cells[i] - surface.camera
     along = np.abs((rays * between).sum(1)) / np.linalg.norm(rays, axis=1)
-    gap = (apart > BREAK * surface.edge) & (along < ACROSS)
+    usual = float(np.median(KDTree(cells).query(cells, k=2)[0][:, 1]))  # of thinned clouds it is more than a cube
+    gap = (apart > BREAK * max(surface.edge, usual)) & (along < ACROSS)
     for joins in (~gap, ~seam[mine].any(1)):
         part = joined(mine[joins], len(own))
         large = np.flatnonzero(np.bincount(part) >= max(PART * len(own), LEAST_PART))
