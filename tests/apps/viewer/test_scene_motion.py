@@ -22,7 +22,7 @@ from dro_grasp.arm.planning.motion import ALL_STAGES, CHOSEN, MotionPlan, PlanNo
 from dro_grasp.arm.planning.placing import height_below
 from dro_grasp.arm.planning.reachability import Fault
 from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import Scene
 from tests.helpers.browser import free_port
@@ -219,3 +219,8 @@ def test_a_thing_on_another_surface_has_that_one_as_an_obstacle(scene: Scene, ro
     assert table is not None
     assert table.height == pytest.approx(0.02)
     assert (table.centre, table.size) == (robot.table.centre, robot.table.size)
+    T = np.eye(4)
+    T[2, 3] = -0.04
+    sunk = scene.moved(T)
+    with pytest.raises(ObjectError, match="hands would go through it"):
+        levelled(robot, sunk.object_at((0.45, 0.0, 0.01)).obj, sunk)
