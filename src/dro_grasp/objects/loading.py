@@ -334,7 +334,7 @@ def _encloses(mesh: trimesh.Trimesh, hull: float) -> bool:
     """Whether an open mesh has an inside, by winding numbers; `hull` is the volume of its convex hull [m^3]."""
     winding, _, cell = _winding(mesh)
     inside, more, maybe = (int((np.abs(winding) > least).sum()) for least in (INSIDE, 0.5, OUTSIDE))
-    return bool(0 < maybe and (inside >= ENCLOSED[0] * maybe or more * cell >= ENCLOSED[1] * hull))
+    return bool(inside >= ENCLOSED[0] * maybe or more * cell >= ENCLOSED[1] * hull)
 
 
 def _spread(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
