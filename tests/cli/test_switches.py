@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -149,7 +150,17 @@ def test_what_is_no_obstacle_is_referred_to_surroundings(tmp_path: Path) -> None
     trimesh.creation.box((1.2, 1.2, 0.1)).export(tmp_path / "wall.stl")
     with pytest.raises(dro.DroGraspError, match=r"too large for an obstacle.*with --surroundings, a mesh or cloud of any size"):
         load_obstacle(str(tmp_path / "wall.stl"))
-    with pytest.raises(dro.DroGraspError) as caught:
-        load_obstacle("nothing_of_that_name")
-    assert "--surroundings" not in str(caught.value)
+    half = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 1, 2], [0, 3, 1]])
+    half.export(tmp_path / "half.stl")
+    flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [2, 1, 3]])
+    flat.export(tmp_path / "flat.stl")
+    for name, said in (("half", "is an open sheet"), ("flat", "encloses no volume")):
+        with pytest.raises(dro.DroGraspError, match=rf"{said}.*clouds and meshes of things.*with --surroundings"):
+            load_obstacle(str(tmp_path / f"{name}.stl"))
+    (tmp_path / "broken.stl").write_bytes(b"hello")
+    np.save(tmp_path / "few.npy", np.eye(3))
+    for name in ("nothing_of_that_name", str(tmp_path / "broken.stl"), str(tmp_path / "few.npy")):
+        with pytest.raises(dro.DroGraspError) as caught:
+            load_obstacle(name)
+        assert "--surroundings" not in str(caught.value)
     assert load_obstacle("can").name == "can"
