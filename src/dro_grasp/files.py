@@ -9,7 +9,7 @@ import secrets
 import shlex
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -22,8 +22,13 @@ from safetensors import SafetensorError
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
 MAX_QUOTED_CHARS = 200  # Characters of a path or a reason that an error repeats (ours)
-CAMERA = ("frame", "T_frame_camera", "intrinsics", "depth_unit")  # Entries of a camera's file
-LIKE = 0.5  # Share of equal letters from which a word may stand for another (ours)
+FRAME_FILE = {
+    "frame": "the frame's name", "T_frame_camera": "the camera's pose in the frame, 4x4 [m]",
+    "intrinsics": "the camera's pinhole matrix, 3x3 [pixels]", "depth_unit": "the metres of one count of a depth image",
+    "T_frame_object": "the object's pose in the frame, 4x4 [m]"}
+"""Entries of the files of cameras and frames, which may be one, and what each is."""
+ELSEWHERE = {"k": "intrinsics", "camera_matrix": "intrinsics", "depth_scale": "depth_unit"}  # Names that other programs use
+LIKE = 0.6  # Share of equal letters from which a word may stand for another (ours)
 SAME = {".yaml": ".yml", ".html": ".htm"}  # Endings of file names, and others that mean the same
 FOREIGN = (
     OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
@@ -53,14 +58,20 @@ def given_path(name: Path | str) -> Path:
     return path
 
 
-def require_known(values: Mapping[str, object], known: Sequence[str], origin: object) -> None:
-    """Refuse entries of a file that nobody reads, by an OptionError that lists the known ones and names a similar one."""
+def require_known(values: Mapping[str, object], known: Mapping[str, str], origin: object) -> None:
+    """Refuse entries of a file that nobody reads, by an OptionError that lists the known ones.
+
+    It names a similar one that the file lacks, and says what that is; `known` has the entries and what each is.
+    """
     for entry in values:
         if entry not in known:
-            alike = {name.lower(): name for name in known}
-            near = [alike[name] for name in difflib.get_close_matches(entry.lower(), alike, n=1, cutoff=LIKE)]
-            raise OptionError(f"{origin} has an entry '{entry}', which nothing reads; known are {', '.join(known)}"
-                              + (f". Call it '{near[0]}', if that is meant" if near else ". Leave it out"))
+            lacking = {name.lower(): name for name in known if name not in values}
+            near = ([ELSEWHERE[entry.lower()]] if entry.lower() in ELSEWHERE
+                    else difflib.get_close_matches(entry.lower(), lacking, n=1, cutoff=LIKE))
+            meant = [lacking[name] for name in near if name in lacking]
+            raise OptionError(f"{origin} has an entry '{entry}', which nothing reads; known are {', '.join(known)}. "
+                              + (f"Call it '{meant[0]}' if it is {known[meant[0]]}; else leave it out" if meant
+                                 else "Leave it out"))
 
 
 def command(*words: object) -> str:

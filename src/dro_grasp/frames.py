@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.files import CAMERA, given_path, require_known
+from dro_grasp.files import FRAME_FILE, given_path, require_known
 
 HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")  # Names of the half-axes, in the order of the indices of `half_axis`
 ROUNDING = 1e-3  # Largest deviation of a rotation's product with its transpose from the identity (ours)
@@ -42,7 +42,8 @@ class NamedMotion(NamedTuple):
 def read_motion(path: Path, key: str) -> NamedMotion:
     """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`, with a key such as `T_frame_object`.
 
-    A camera's file may also hold its intrinsics and the unit of its depths. OptionError: the file holds something else.
+    One file may hold the poses of camera and object, and the camera's intrinsics and unit of depths. OptionError: it holds
+    something else.
     """
     path = given_path(path)
     wanted = f'{path} must hold {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
@@ -55,7 +56,7 @@ def read_motion(path: Path, key: str) -> NamedMotion:
         raise OptionError(f"{wanted}; it has no entry {error}") from error
     except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
         raise OptionError(f"{wanted}; it does not ({error})") from error
-    require_known(values, CAMERA if key in CAMERA else ("frame", key), path)
+    require_known(values, FRAME_FILE, path)
     if not is_name(name):
         raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name on one line")
     if (fault := motion_fault(T)) is not None:

@@ -88,6 +88,9 @@ def test_options_of_a_scene_need_one(weights: str, capsys) -> None:
     (["--protocol", "carry"], "--protocol carry asks for a trial in simulation, and a thing of a scene is a bare point cloud"),
     (["--only-successful"], "--only-successful asks for a trial in simulation, and a thing of a scene is a bare point cloud"),
     (["--keep-table"], "the table of a scene is found in any case"),
+    (["--protocol", "carry", "--only-successful"],
+     "leave out --protocol carry and --only-successful, or give the object's mesh with --object and leave out --scene and "
+     "--camera"),
 ])
 def test_what_no_scene_can_do_is_refused_before_it_is_read(
     common: list[str], more: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys
@@ -132,3 +135,12 @@ def test_a_page_that_cannot_be_shown_is_refused_before_the_work(
     monkeypatch.setitem(extras.EXTRAS, "apps", ("no_such_package",))
     assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--view"]) == 2
     assert "no_such_package" in capsys.readouterr().err
+    assert main(["generate", "--hand", "gripper3", "--object", "mug", "--view", "--server", "http://127.0.0.1:9"]) == 2
+    assert "a grasp server cannot do --view" in capsys.readouterr().err, "the extra would not help"
+
+
+def test_a_trial_of_what_a_camera_sees_needs_a_mesh_without_the_camera(weights: str, capsys) -> None:
+    assert main(["generate", "--hand", "gripper3", "--weights", weights, "--object", "c.npy", "--camera", "c.json",
+                 "--protocol", "carry"]) == 2
+    assert "leave out --protocol carry, or give the object's mesh with --object and leave out --camera" in " ".join(
+        capsys.readouterr().err.split())

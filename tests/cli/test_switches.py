@@ -6,17 +6,23 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 
 import dro_grasp as dro
 from dro_grasp.cli import output
+from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.inputs import load_obstacle
 from dro_grasp.cli.main import main
-from dro_grasp.cli.robots import Plan
+from dro_grasp.cli.robots import Plan, Tabletop
 from dro_grasp.cli.switches import in_switches, use_options_of
+from dro_grasp.cli.view import View
+from dro_grasp.objects.perception.things import AS_SCENE
+from dro_grasp.simulation.scene import require_simulable
 
 SOURCE = Path(__file__).parents[2] / "src" / "dro_grasp"
 SWITCH = re.compile(r"(?<![\w-])--[a-z]")
@@ -90,6 +96,41 @@ def test_a_command_is_told_of_its_own_options_alone(told: str, generated: str, p
         use_options_of(None)
 
 
+CHOICE = "--nearest, --at X Y Z or --pixel U V"
+
+
+@pytest.mark.parametrize(("command", "words"), [
+    (Generate("gripper3"), f"(--scene FILE --camera JSON, and {CHOICE})"),
+    (Plan("robot"), f"(--scene FILE --camera JSON, and {CHOICE})"),
+    (View(), "(--scene FILE --camera JSON, and a click on the page)"),
+    (Evaluate(Path("g.parquet")), f"(`dro-grasp generate --scene FILE --camera JSON` with {CHOICE})"),
+    (Tabletop("robot", ("can",)), f"(`dro-grasp generate --scene FILE --camera JSON` with {CHOICE})"),
+    (None, f"(--scene FILE --camera JSON, and {CHOICE})"),
+])
+def test_each_command_is_told_of_scenes_in_one_language(command: Any, words: str) -> None:
+    try:
+        use_options_of(command)
+        told = in_switches(f"a view; {AS_SCENE}.")
+    finally:
+        use_options_of(None)
+    assert told == f"a view; give it as a scene, of which one thing is meant {words}."
+
+
+def test_what_a_command_lacks_is_named_as_generate_has_it() -> None:
+    evaluate = Evaluate(Path("g.parquet"))
+    try:
+        use_options_of(evaluate)
+        assert in_switches("its pose (camera=...)") == "its pose (`dro-grasp generate --camera JSON`)"
+        assert in_switches("from above (direction=(0, 0, -1))") == "from above (`dro-grasp generate --direction 0 0 -1`)"
+        assert in_switches("without only_successful=True") == "without --only-successful"
+        with pytest.raises(dro.DroGraspError, match="a trial needs a mesh") as caught:
+            require_simulable(dro.load_hand("gripper3"), dro.load_object(dro.load_object("can").cloud))
+        use_options_of(Plan("robot"))
+        assert in_switches(str(caught.value)).endswith("a trial needs a mesh (--object); or make no trial")
+    finally:
+        use_options_of(None)
+
+
 @pytest.mark.parametrize("command", [
     ["plan", "--object"], ["tabletop", "--objects"], ["clear", "--objects"], ["generate", "--hand", "gripper3", "--object"]])
 def test_no_command_is_told_of_a_scale_that_it_lacks(
@@ -109,7 +150,17 @@ def test_what_is_no_obstacle_is_referred_to_surroundings(tmp_path: Path) -> None
     trimesh.creation.box((1.2, 1.2, 0.1)).export(tmp_path / "wall.stl")
     with pytest.raises(dro.DroGraspError, match=r"too large for an obstacle.*with --surroundings, a mesh or cloud of any size"):
         load_obstacle(str(tmp_path / "wall.stl"))
-    with pytest.raises(dro.DroGraspError) as caught:
-        load_obstacle("nothing_of_that_name")
-    assert "--surroundings" not in str(caught.value)
+    half = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 1, 2], [0, 3, 1]])
+    half.export(tmp_path / "half.stl")
+    flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [2, 1, 3]])
+    flat.export(tmp_path / "flat.stl")
+    for name, said in (("half", "is an open sheet"), ("flat", "encloses no volume")):
+        with pytest.raises(dro.DroGraspError, match=rf"{said}.*clouds and meshes of things.*with --surroundings"):
+            load_obstacle(str(tmp_path / f"{name}.stl"))
+    (tmp_path / "broken.stl").write_bytes(b"hello")
+    np.save(tmp_path / "few.npy", np.eye(3))
+    for name in ("nothing_of_that_name", str(tmp_path / "broken.stl"), str(tmp_path / "few.npy")):
+        with pytest.raises(dro.DroGraspError) as caught:
+            load_obstacle(name)
+        assert "--surroundings" not in str(caught.value)
     assert load_obstacle("can").name == "can"

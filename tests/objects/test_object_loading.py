@@ -256,6 +256,31 @@ def test_open_meshes_of_few_faces_that_enclose_are_taken(mesh: trimesh.Trimesh, 
     assert obj.volume == pytest.approx(volume, rel=0.15)
 
 
+def loose(mesh: trimesh.Trimesh, *turned: int, apart: float = 0.0) -> trimesh.Trimesh:
+    """The mesh with its own corners for each face, some faces turned, and corners that lie `apart` [m]."""
+    corners = np.array(mesh.triangles)
+    corners[list(turned)] = corners[list(turned), ::-1]
+    corners = corners.reshape(-1, 3) + np.random.default_rng(0).normal(0, apart, (3 * len(corners), 3))
+    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+
+
+@pytest.mark.parametrize("mesh", [
+    *(loose(sides_of(CUBE, LEFT, RIGHT, FRONT, BACK), face) for face in (0, 3, 7)),
+    *(loose(trimesh.creation.box(CUBE), *range(first, 12, 3), apart=1e-5) for first in range(3)),
+], ids=["tube 0", "tube 3", "tube 7", "faces 0", "faces 1", "faces 2"])
+def test_open_meshes_of_mixed_winding_are_judged_as_they_are_repaired(mesh: trimesh.Trimesh, tmp_path: Path) -> None:
+    assert load_file(save(mesh, tmp_path / "open.ply")).volume == pytest.approx(1e-3, rel=0.15)
+
+
+@pytest.mark.parametrize("doubled", [slice(None, None, -1), slice(None)], ids=["reversed", "repeated"])
+@pytest.mark.parametrize("normals", [(DOWN, LEFT), (DOWN, LEFT, RIGHT), (DOWN, LEFT, FRONT), (LEFT, RIGHT)])
+def test_sheets_of_doubled_faces_are_sheets(normals: tuple[tuple[int, int, int], ...], doubled: slice, tmp_path: Path) -> None:
+    sheet = sides_of(CUBE, *normals)
+    both = trimesh.Trimesh(sheet.vertices, np.concatenate([sheet.faces, sheet.faces[:, doubled]]), process=False)
+    with pytest.raises(ObjectError, match="is an open sheet and encloses nothing"):
+        load_file(save(both, tmp_path / "sheet.ply"))
+
+
 def test_loose_faces_of_a_hollow_thing_are_no_sheet(tmp_path: Path) -> None:
     """A frame of two bars whose faces do not meet, and which fills a third of its hull."""
     bars = [trimesh.creation.box((0.1, 0.02, 0.02)).apply_translation((0.05, 0, 0)),

@@ -188,14 +188,16 @@ class Generate:
                               "is found in any case, and hands stay above it")
         what = "a thing of a scene" if self.scene is not None else "what a camera sees" if self.camera is not None else None
         tried = self.protocol not in {None, "none"}
-        if what is not None and (tried or self.only_successful):
-            option = f"--protocol {self.protocol}" if tried else "--only-successful"
-            raise OptionError(f"{option} asks for a trial in simulation, and {what} is a bare point cloud, which gets none; "
-                              f"leave {option} out, or give the object's mesh with --object")
+        asked = [f"--protocol {self.protocol}"] * tried + ["--only-successful"] * self.only_successful
+        if what is not None and asked:
+            options, verb = " and ".join(asked), "asks" if len(asked) == 1 else "ask"
+            seen = " and ".join(["--scene"] * (self.scene is not None) + ["--camera"] * (self.camera is not None))
+            raise OptionError(f"{options} {verb} for a trial in simulation, and {what} is a bare point cloud, which gets none; "
+                              f"leave out {options}, or give the object's mesh with --object and leave out {seen}")
         if self.only_successful and self.protocol == "none":
             raise OptionError("--only-successful saves what passed a trial, and --protocol none asks for none; name a "
                               "--protocol, or leave --only-successful out")
-        if self.view:
+        if self.view and server_of(self.server) is None:
             require_extra("apps")
 
     def _parts(self, jobs: list[Any]) -> list[list[Any]]:

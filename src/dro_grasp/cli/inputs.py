@@ -22,6 +22,8 @@ Ball = tuple[float, float, float, float]  # Centre and radius [m]
 Mass = Annotated[float | None, tyro.conf.arg(metavar="KG", help_behavior_hint="(default: density times volume)")]
 Friction = Annotated[float, tyro.conf.arg(
     metavar="MU", help="Friction between hand, objects and table, in simulation and in the planner's rehearsals.")]
+AVOIDED = ("for a hand to grasp", "is an open sheet", "encloses no volume")
+"""What is said of things of other sizes and of sheets, which are no things to grasp, and may still be in the way."""
 Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 
@@ -34,20 +36,19 @@ def load_obstacle(name: str) -> ObjectModel:
     """A thing that is not grasped, and on which another may be put.
 
     Raises:
-        ObjectError: It cannot be loaded as a thing; of a file the message says how anything else is avoided.
+        ObjectError: It cannot be loaded as a thing; of one of another size, and of a sheet, the message says how it is avoided.
     """
     from dro_grasp.errors import ObjectError
-    from dro_grasp.files import given_path
     from dro_grasp.objects.catalogue import load_object
 
     try:
         return load_object(name)
     except ObjectError as error:
-        if not given_path(name).is_file():
+        if not any(refused in str(error) for refused in AVOIDED):
             raise
         told = str(error).replace("for a hand to grasp", "for an obstacle")
-        raise ObjectError(f"{told}. Obstacles are closed things of 5 mm to 1 m; anything else to stay clear of is given with "
-                          "--surroundings, a mesh or cloud of any size") from error
+        raise ObjectError(f"{told}. --obstacles takes clouds and meshes of things, 5 mm to 1 m large, meshes with an inside; "
+                          "all else to stay clear of is given with --surroundings, a mesh or cloud of any size") from error
 
 
 @dataclass(frozen=True)

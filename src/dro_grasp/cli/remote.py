@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from dro_grasp.cli.output import print_json, progress_bar, say_aside
 from dro_grasp.cli.switches import in_switches
 from dro_grasp.errors import OptionError, ServerError
-from dro_grasp.files import CAMERA, UNTYPED, check_output, given_path, reading, replacing, require_known
+from dro_grasp.files import FRAME_FILE, UNTYPED, check_output, given_path, reading, replacing, require_known
 
 if TYPE_CHECKING:
     from dro_grasp.cli.generate import Generate
@@ -111,7 +111,7 @@ def sent_camera(path: Path) -> dict[str, Any]:
     with reading(path, OptionError, wanted, *UNTYPED):
         values = json.loads(path.read_text())
         rows = [[struct.unpack("f", struct.pack("f", number))[0] for number in row] for row in values[key]]
-        require_known(values, CAMERA, path)
+        require_known(values, FRAME_FILE, path)
         return {"frame": values["frame"], key: rows}
 
 

@@ -14,8 +14,15 @@ ARGUMENT = re.compile(r"(?<![\w.`'/+-])([a-z][a-z0-9_]*)=(\.\.\.|\([^()\n]*\)|'[
 INSTEAD = {
     "scale": ("a file in metres", "a file with all coordinates times {}"),
     "keep_table": ("load_object with keep_table in Python", "load_object(..., keep_table={}) in Python"),
+    "camera": ("`dro-grasp generate --camera JSON`", "`dro-grasp generate --camera {}`"),
+    "direction": ("`dro-grasp generate --direction X Y Z`", "`dro-grasp generate --direction {}`"),
+    "only_successful": ("--only-successful", "--only-successful"),
 }
 """What helps where a command has no such option: of any value, and of a certain one."""
+
+AS_SCENE = re.compile(r"\((scene=FILE camera=JSON)(, and )(nearest=True, at=\(X, Y, Z\) or pixel=\(U, V\)); "
+                      r"load_scene and object_at in Python\)")
+"""How a cloud is given as a scene and one thing of it is chosen, as the package says it (objects/perception/things.py)."""
 
 _running: list[frozenset[str]] = []  # Options of the command that runs; empty while none does
 
@@ -28,19 +35,36 @@ def use_options_of(command: Any | None) -> None:
 def in_switches(text: str) -> str:
     """A message with the options of the running command in place of arguments of their names; the rest stays.
 
-    What is said of a scale or a table that this command cannot be told becomes what helps instead.
+    What this command cannot be told, such as a scale or a scene, becomes what helps instead.
     """
-    return ARGUMENT.sub(_switch, text)
+    return ARGUMENT.sub(_switch, AS_SCENE.sub(_scene, text))
+
+
+def _scene(found: re.Match[str]) -> str:
+    scene, also, choice = found.groups()
+    if not _running or {"scene", "nearest", "at", "pixel"} <= _running[0]:
+        return f"({scene}{also}{choice})"
+    if "scene" in _running[0]:
+        return f"({scene}, and a click on the page)"
+    scene, choice = (ARGUMENT.sub(lambda each: _typed(*each.groups()), part) for part in (scene, choice))
+    return f"(`dro-grasp generate {scene}` with {choice})"
 
 
 def _switch(found: re.Match[str]) -> str:
     name, value = found.groups()
     if name in (_running[0] if _running else _options()):
-        words = "" if value in {"...", "True"} else value.strip("()'").replace(",", "")
-        return f"--{name.replace('_', '-')}" + (f" {words}" if words else "")
+        return _typed(name, value)
     if _running and name in INSTEAD:
-        return INSTEAD[name][value != "..."].format(value)
+        return INSTEAD[name][value != "..."].format(_words(value))
     return found[0]
+
+
+def _typed(name: str, value: str) -> str:
+    return " ".join(filter(None, [f"--{name.replace('_', '-')}", "" if value in {"...", "True"} else _words(value)]))
+
+
+def _words(value: str) -> str:
+    return value.strip("()'").replace(",", "")
 
 
 def _names(command: Any) -> Iterator[str]:

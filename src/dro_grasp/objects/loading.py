@@ -302,7 +302,7 @@ def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
     if len(mesh.faces) > 100 and alone > 0.9:  # (ours) their inside takes minutes to tell
         raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
                           "alone; join the faces (merge vertices), or give a point cloud of the surface")
-    if (border := _border(mesh)) > BORDER and _is_sheet(mesh):
+    if (border := _border(mesh)) > BORDER and _is_sheet(_wound(mesh)):
         raise ObjectError(f"{origin} is an open sheet and encloses nothing: {border:.0%} of the length of the edges of its "
                           f"{len(mesh.faces)} faces belongs to one face alone; close it, give it a thickness, or give a point "
                           "cloud of the surface")
@@ -314,13 +314,37 @@ def _border(mesh: trimesh.Trimesh) -> float:
     return float(mesh.edges_unique_length[faces == 1].sum() / max(mesh.edges_unique_length.sum(), 1e-12))
 
 
+def _wound(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A copy of an open mesh without repeated faces and reverses, in which neighbours are wound alike; no hole is closed."""
+    mesh = mesh.copy()
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    trimesh.repair.fix_winding(mesh)
+    return mesh
+
+
 def _is_sheet(mesh: trimesh.Trimesh) -> bool:
-    """Whether an open mesh encloses next to nothing, by winding numbers; flat ones, which have no hull, are refused later."""
+    """Whether an open mesh encloses next to nothing; flat ones, which have no hull, are refused later."""
     if (hull := _hull(mesh)) is None or hull.volume < LEAST_FILL * float(np.prod(mesh.extents)):
         return False
+    return not (mesh.is_watertight or _encloses(mesh, hull.volume) or _encloses(_spread(mesh), hull.volume))
+
+
+def _encloses(mesh: trimesh.Trimesh, hull: float) -> bool:
+    """Whether an open mesh has an inside, by winding numbers; `hull` is the volume of its convex hull [m^3]."""
     winding, _, cell = _winding(mesh)
     inside, more, maybe = (int((np.abs(winding) > least).sum()) for least in (INSIDE, 0.5, OUTSIDE))
-    return inside < ENCLOSED[0] * maybe and bool(more * cell < ENCLOSED[1] * hull.volume)
+    return bool(inside >= ENCLOSED[0] * maybe or more * cell >= ENCLOSED[1] * hull)
+
+
+def _spread(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A copy of which each connected piece faces away from the middle: the winding of faces that meet no other is unknown."""
+    faces, apart = np.array(mesh.faces), np.asarray(mesh.triangles) - np.asarray(mesh.bounds).mean(0)
+    volumes = np.linalg.det(apart)  # that each face spans with the middle, six times
+    for piece in trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1):
+        if volumes[piece].sum() < 0:
+            faces[piece] = faces[piece][:, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:

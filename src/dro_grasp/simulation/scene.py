@@ -225,8 +225,7 @@ def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | P
 def require_simulable(hand: Hand, obj: ObjectModel) -> None:
     """Refuse a cloud without balls that stand for it (ObjectError), and a hand without its description (HandError)."""
     if obj.is_cloud and obj.balls is None:
-        raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (object=...), or none is made with "
-                          "protocol='none'")
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (object=...); or make no trial")
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
 

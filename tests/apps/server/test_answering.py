@@ -203,6 +203,8 @@ def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answer
         assert np.linalg.norm(found.obstacles.points - made.middles[k], axis=1).min() < 0.05
     with pytest.raises(ObjectError, match="shows 4 things"):
         ask(answerer, sent, camera=camera, choose={})
+    with pytest.raises(OptionError, match=r"choose is given, and keep_table keeps a table .* leave keep_table out"):
+        ask(answerer, sent | {"keep_table": True}, camera=camera, choose={"at": middle})
     by_mask = answerer.chosen(GraspCall(
         hand="gripper3", object=sent, camera=camera, choose={"mask": sent_mask(made.owner == 1)}, **QUICK))
     np.testing.assert_array_less(abs(by_mask.obj.extents - found.obj.extents), 0.01)

@@ -22,7 +22,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import object_of, with_sources
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import visible_points
-from dro_grasp.objects.perception.scan import depth_points, load_scan, scanned_object, without_outliers
+from dro_grasp.objects.perception.scan import check_depths, depth_points, load_scan, scanned_object, without_outliers
 from dro_grasp.objects.shape import ObjectModel
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
@@ -149,6 +149,21 @@ def test_depths_nearer_than_a_camera_measures_are_refused(median: float, told: s
     with pytest.raises(ObjectError) as caught:
         depth_points(np.full(SHAPE, median), INTRINSICS)
     assert told in str(caught.value)
+    assert str(caught.value).endswith(". Give metres"), "there is neither a scale nor a stated unit"
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({}, "millimetres already; leave out a scale (if one is given) or correct the camera's depth_unit"),
+    ({"scale": 1.0}, "millimetres already; correct the camera's depth_unit"),
+    ({"scale": 0.001}, "millimetres already; leave out a scale (scale=0.001) or correct the camera's depth_unit"),
+    ({"scale": 0.001, "with_unit": False}, ". Give metres; leave out a scale (scale=0.001)"),
+    ({"scale": 1.0, "with_unit": False}, ". Give metres"),
+])
+def test_a_scale_and_a_unit_are_named_where_they_may_be_wrong(given: dict[str, Any], said: str) -> None:
+    check_depths(1.0, **given)
+    with pytest.raises(ObjectError) as caught:
+        check_depths(0.0008, **given)
+    assert str(caught.value).endswith(said)
 
 
 def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:

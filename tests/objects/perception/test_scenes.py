@@ -325,10 +325,12 @@ def test_the_picture_shows_object_table_and_obstacles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("entry", "told"), [
-    ("depth_scale", "Call it 'depth_unit'"), ("Intrinsics", "Call it 'intrinsics'"), ("D", "Leave it out")])
+    ("depth_scale", "Call it 'depth_unit' if it is the metres of one count"), ("Intrinsics", "Call it 'intrinsics' if it is"),
+    ("D", "Leave it out")])
 def test_entries_of_a_camera_that_nothing_reads_are_refused(entry: str, told: str, tmp_path: Path) -> None:
     path = _saved(make_scene("table", 1, 0, width=160), tmp_path)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {entry: 0.00025}))
+    values = json.loads(path.read_text()) | {entry: 0.00025}
+    path.write_text(json.dumps({name: value for name, value in values.items() if name == entry or name != entry.lower()}))
     for read in (as_camera, lambda p: read_motion(p, "T_frame_camera"), sent_camera):
         with pytest.raises(OptionError, match=f"has an entry '{entry}'.*known are frame, T_frame_camera, intrinsics.*{told}"):
             read(path)

@@ -216,11 +216,14 @@ class Answerer:
 
         Raises:
             ObjectError: It is not there, or it is not clear which is meant.
-            OptionError: The scene is named.
+            OptionError: The scene is named, or its table is to be kept.
         """
         sent, camera, choice = call.object, call.camera, call.choose
         if sent.name is not None:
             raise OptionError(f"choose is given, and the object is named '{sent.name}'; send the scene")
+        if sent.keep_table:
+            raise OptionError("choose is given, and keep_table keeps a table that is in an object's own cloud; leave "
+                              "keep_table out: the table of a scene is found in any case, and hands stay above it")
 
         def load() -> Scene:
             seen_by = None if camera is None else SceneCamera(

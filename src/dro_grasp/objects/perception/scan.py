@@ -73,7 +73,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    check_depths(float(np.median(image[valid])))
+    check_depths(float(np.median(image[valid])), scale=1.0, with_unit=False)
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
     rays = np.linalg.solve(matrix, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
@@ -113,18 +113,22 @@ def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int,
                           f"{expected}")
 
 
-def check_depths(median: float) -> None:
+def check_depths(median: float, scale: float | None = None, with_unit: bool = True) -> None:
     """Refuse depths whose median [m] is too far or too near for a camera, by an ObjectError that names their likely unit.
 
     A camera measures nothing nearer than some centimetres: such depths were divided by 1000 twice, or are in a larger unit.
+    `scale` is what they were multiplied by, 1 where nothing was given, None where it is not known; `with_unit` tells whether
+    they are of a depth image, of which the camera may state the unit.
     """
     least, most = DEPTHS
     if 0 < median < NEAREST:
         found = {1 / size: median / size for size in DEPTH_UNITS.values() if least <= median / size <= most}
         told = "".join(f"; times {factor:.0f} it is {depth:.3g} m" for factor, depth in found.items())
+        steps = [] if scale == 1 else ["leave out a scale" + (" (if one is given)" if scale is None else f" (scale={scale:g})")]
+        steps += ["correct the camera's depth_unit"] * with_unit
+        whole = ": whole numbers in an image count as millimetres already" if with_unit else ""
         raise ObjectError(f"the median depth is {median:.3g} m, nearer than a depth camera measures ({NEAREST:g} m){told}. "
-                          "Give metres: whole numbers in an image count as millimetres already, so leave out a scale, or "
-                          "correct the camera's depth_unit")
+                          + "; ".join(filter(None, [f"Give metres{whole}", " or ".join(steps)])))
     if median <= most:
         return
     found = {unit: size for unit, size in DEPTH_UNITS.items() if least <= median * size <= most}
