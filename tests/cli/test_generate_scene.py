@@ -32,7 +32,7 @@ def common(made: MadeScene, weights: str, tmp_path_factory: pytest.TempPathFacto
     (folder / "camera.json").write_text(json.dumps({
         "frame": "base", "T_frame_camera": made.camera.T_frame_camera.tolist(),
         "intrinsics": np.asarray(made.camera.intrinsics).tolist()}))
-    return ["generate", "--hand", "gripper3", "--weights", weights, "--num", "2", "--candidates", "1", "--source", "network",
+    return ["generate", "--hand", "gripper3", "--weights", weights, "--num", "2", "--candidates", "4", "--source", "network",
             "--no-refine", "--scene", str(folder / "depth.png"), "--camera", str(folder / "camera.json")]
 
 

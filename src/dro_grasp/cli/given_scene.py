@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from dro_grasp.cli.robots import Plan
     from dro_grasp.objects.scenery import FoundObject, Scene
 
-TAKEN = "what was taken for the object: {}"
 CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
+TAKEN = "what was taken for the object: {}"  # Said of a picture
 
 
 def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:

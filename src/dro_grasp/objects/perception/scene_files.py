@@ -122,7 +122,7 @@ def sight_of_depth(depth: Num[np.ndarray, "..."], camera: SceneCamera | None, sc
     if not len(pixels):
         raise ObjectError(f"no pixel of {origin} has a depth; give depths along z, and 0 or NaN for none")
     z = image.ravel()[pixels]
-    check_depths(float(np.median(z)))
+    check_depths(float(np.median(z)), scale)
     row, column = np.divmod(pixels, width)
     rays = np.linalg.solve(camera.intrinsics, np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return Sight((rays / rays[2] * z).T, camera.T_frame_camera, True, pixels, (height, width), camera.intrinsics)
