@@ -91,8 +91,9 @@ def choose(
         raise OptionError("part asks for one side of things that touch; say by a place (at=(X, Y, Z)) or a pixel "
                           "(pixel=(U, V)) which")
     if mask is not None:
-        own = _masked(name, sight, segments, mask)
-        return _chosen(sight, segments, own, _left_out(name, sight, segments, mask, own))
+        inside = within(name, sight, mask)
+        own = _masked(name, sight, segments, inside)
+        return _chosen(sight, segments, own, _left_out(sight, segments, inside, own))
     if not segments.count:
         raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
                           "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
@@ -252,8 +253,7 @@ def all_within(name: str, sight: Sight, segments: Segments, mask: Any) -> Chosen
     return _chosen(sight, segments, np.flatnonzero(within(name, sight, mask)), ())
 
 
-def _masked(name: str, sight: Sight, segments: Segments, mask: Any) -> Int[np.ndarray, " k"]:
-    inside = within(name, sight, mask)
+def _masked(name: str, sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
     plane = _plane_of(sight, segments)
     faces = _faces(sight, segments, plane, inside)
     own = np.flatnonzero(inside & ((plane < 0) | faces[plane]))
@@ -308,10 +308,10 @@ def _covered(
 
 
 def _left_out(
-    name: str, sight: Sight, segments: Segments, mask: Any, own: Int[np.ndarray, " k"]
+    sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"], own: Int[np.ndarray, " k"]
 ) -> tuple[str, ...]:
     """A note on other things that a mask shows as well."""
-    left = within(name, sight, mask)
+    left = inside.copy()
     left[own] = False
     things = segments.labels >= 0
     left = np.bincount(segments.labels[left & things], minlength=segments.count)
