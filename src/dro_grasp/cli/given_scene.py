@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dro_grasp.cli.output import say_aside
@@ -11,10 +14,10 @@ if TYPE_CHECKING:
     from dro_grasp.arm.tabletop.table_scene import PickedObject
     from dro_grasp.cli.generate import Generate
     from dro_grasp.cli.robots import Plan
+    from dro_grasp.objects.perception.choosing import Chosen
     from dro_grasp.objects.scenery import FoundObject, Scene
 
 CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which thing of a scene is meant
-TAKEN = "what was taken for the object: {}"  # Said of a picture
 
 
 def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
@@ -39,42 +42,44 @@ def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
 
 def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
     """The one thing of the scene that is meant; the picture is drawn even where none is."""
-    from dro_grasp.errors import ObjectError
-    from dro_grasp.pictures.scene import draw_scene
-
-    picture = command.scene_picture
-    try:
+    with _picture_if_refused(scene, command.scene_picture):
         found = scene.object_at(command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest, part=command.part)
-    except ObjectError:
-        if picture is not None and scene.sight is not None:
-            draw_scene(scene, None, picture)
-            say_aside(f"what the scene shows: {picture}")
-        raise
-    if picture is not None:
-        draw_scene(scene, found, picture)
-        say_aside(TAKEN.format(picture))
+    _picture(scene, found, command.scene_picture)
     return found
 
 
 def find_on_table(scene: Scene, robot: Robot, command: Plan) -> PickedObject:
     """The thing on a robot's table that is meant, flat or not; the picture is drawn in either case."""
     from dro_grasp.arm.tabletop.table_scene import as_picked, picked_flat
-    from dro_grasp.errors import ObjectError
     from dro_grasp.objects.perception.choosing import all_within
-    from dro_grasp.pictures.scene import draw_scene
 
-    picture = command.scene_picture
-    try:
+    with _picture_if_refused(scene, command.scene_picture):
         flat = None if command.mask is None else picked_flat(scene, robot, command.mask)
-    except ObjectError:
-        if picture is not None and scene.sight is not None:
-            draw_scene(scene, None, picture)
-            say_aside(f"what the scene shows: {picture}")
-        raise
     if flat is None:
         return as_picked(find_thing(scene, command), robot, scene)
-    if picture is not None:
+    if command.scene_picture is not None:
         assert scene.sight is not None
-        draw_scene(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), picture)
-        say_aside(TAKEN.format(picture))
+        _picture(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), command.scene_picture)
     return flat
+
+
+@contextmanager
+def _picture_if_refused(scene: Scene, path: Path | None) -> Iterator[None]:
+    """Draw what the scene shows where nothing of it can be taken."""
+    from dro_grasp.errors import ObjectError
+
+    try:
+        yield
+    except ObjectError:
+        if scene.sight is not None:
+            _picture(scene, None, path)
+        raise
+
+
+def _picture(scene: Scene, found: FoundObject | Chosen | None, path: Path | None) -> None:
+    """Draw the scene, and what was taken of it, if there is a path to draw to."""
+    from dro_grasp.pictures.scene import draw_scene
+
+    if path is not None:
+        draw_scene(scene, found, path)
+        say_aside(f"{'what the scene shows' if found is None else 'what was taken for the object'}: {path}")

@@ -46,9 +46,11 @@ def load_obstacle(name: str) -> ObjectModel:
     except ObjectError as error:
         if not any(refused in str(error) for refused in AVOIDED):
             raise
-        told = str(error).replace("for a hand to grasp", "for an obstacle")
-        raise ObjectError(f"{told}. --obstacles takes clouds and meshes of things, 5 mm to 1 m large, meshes with an inside; "
-                          "all else to stay clear of is given with --surroundings, a mesh or cloud of any size") from error
+        size, grasped, _ = str(error).partition("for a hand to grasp")  # After it follow words on scenes and scales
+        told = f"{size}for an obstacle" if grasped else size
+        advice = ("--obstacles takes clouds and meshes of things, in metres, 5 mm to 1 m large, meshes with an inside; "
+                  "all else to stay clear of is given with --surroundings, a mesh or cloud of any size")
+        raise ObjectError(f"{told}. {advice}") from error
 
 
 @dataclass(frozen=True)

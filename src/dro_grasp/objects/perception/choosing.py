@@ -258,8 +258,10 @@ def _masked(name: str, sight: Sight, segments: Segments, inside: Bool[np.ndarray
     faces = _faces(sight, segments, plane, inside)
     own = np.flatnonzero(inside & ((plane < 0) | faces[plane]))
     if len(own) < LEAST_MASK:
+        flat = "" if inside.sum() < LEAST_MASK else (
+            " (what lies too flat to stand out is taken from a robot's table only, by pick_object or `dro-grasp plan --mask`)")
         raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
-                          f"needed; give one that is true on the object. '{name}' shows {listed(sight, segments)}")
+                          f"needed; give one that is true on the object{flat}. '{name}' shows {listed(sight, segments)}")
     # Masks reach over an object's outline: of what is behind it, the part with fewer points is left out.
     labels = segments.labels[own]
     if (labels >= 0).any():
