@@ -17,17 +17,7 @@ from dro_grasp.simulation.protocols import CARRY, STRICT, Protocol
 from dro_grasp.simulation.rollout import Conditions, Rollout
 from dro_grasp.simulation.scene import build_scene
 from dro_grasp.simulation.worlds import STATE, ProcessorWorlds
-from tests.helpers.claw import ball, claw, power_grasp
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
+from tests.helpers.claw import power_grasp
 
 
 @pytest.fixture(scope="module")

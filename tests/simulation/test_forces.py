@@ -28,19 +28,9 @@ from dro_grasp.simulation.pressure import Pressing
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import RAMP
 from dro_grasp.simulation.scene import scene_of
-from tests.helpers.claw import ball, claw, power_grasp
+from tests.helpers.claw import power_grasp
 
 AXES = [*np.eye(3), *-np.eye(3)]
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 def pinched(hand: Hand, force: float, lever: float = 0.05) -> Squeezes:

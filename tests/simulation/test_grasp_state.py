@@ -31,19 +31,9 @@ from dro_grasp.simulation.protocols import CARRY
 from dro_grasp.simulation.rollout import Pulls, rollouts
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import simulate
-from tests.helpers.claw import ball, claw, power_grasp
+from tests.helpers.claw import power_grasp
 
 MASS = torch.tensor([0.1])
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 def pinch(pressure: float, points: int = 2) -> ContactForces:

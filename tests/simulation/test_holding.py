@@ -18,14 +18,9 @@ from dro_grasp.simulation.holding import closing_of, expect_hold, rest
 from dro_grasp.simulation.protocols import ROBUST
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import scene_of
-from tests.helpers.claw import ball, claw, power_grasp
+from tests.helpers.claw import ball, power_grasp
 
 RADIUS = 0.04  # Of the ball [m]; between smaller ones the fingers meet each other
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
 
 
 @pytest.fixture(scope="module")

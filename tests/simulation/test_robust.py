@@ -26,7 +26,7 @@ from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import record, simulate
-from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+from tests.helpers.claw import grasps_of, power_grasp, wrist_below
 
 ROBUST = protocol("robust").perturbations
 NUMBERS = ("success", "displacement", "rotation", "closing_shift", "closing_rotation", "penetration", "fingers_in_contact")
@@ -39,16 +39,6 @@ VICE = """<mujoco model="vice"><compiler autolimits="true"/><worldbody><body nam
     <geom type="box" size="0.005 0.03 0.03" pos="0.005 0 0" mass="0.1"/></body>
 </body></worldbody></mujoco>"""
 """Two parallel jaws, 4 cm apart at zero."""
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 def perturbed(name: str = "strict", **changes: object) -> Protocol:

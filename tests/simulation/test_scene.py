@@ -19,7 +19,7 @@ from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.piercing import bones
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, attach, build_scene, cached_scene
-from tests.helpers.claw import ball, claw, grasps_of, wrist_below
+from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.claw_urdf import LIMIT, claw as claw_text, joint, written
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -28,11 +28,6 @@ GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.
 <geom type="box" size="0.006 0.012 0.03" mass="0.05"/></body>
 <body name="right" pos="0.05 0 0.04"><joint name="right" type="slide" axis="-1 0 0" range="0 0.045"/>
 <geom type="box" size="0.006 0.012 0.03" mass="0.05"/></body></body></worldbody></mujoco>"""
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
 
 
 @pytest.fixture(scope="module")

@@ -22,18 +22,8 @@ from dro_grasp.simulation.grasp_state import grasp_state
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import TrialResult, after_closing, record, settle, simulate
-from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+from tests.helpers.claw import claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.loaded_hands import loaded_hand
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 def same(a: TrialResult, b: TrialResult) -> None:

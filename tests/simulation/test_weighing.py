@@ -19,20 +19,10 @@ from dro_grasp.simulation.protocols import CARRY
 from dro_grasp.simulation.rollout import ObjectState, Rollout
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
-from tests.helpers.claw import ball, claw, power_grasp
+from tests.helpers.claw import power_grasp
 
 NOTHING_ADDED = WeightConfig(margin=0.0)
 FINE = WeighingConfig(rounds=8)
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 @pytest.fixture(scope="module")

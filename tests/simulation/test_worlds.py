@@ -39,20 +39,10 @@ from dro_grasp.simulation.weighing import weigh
 from dro_grasp.simulation.worlds import STATE, WARP
 from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.worker import EngineConfig, Wanted
-from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+from tests.helpers.claw import grasps_of, power_grasp, wrist_below
 from tests.helpers.fake_device import fake_device
 from tests.helpers.steady_grasps import steady_grasps
 from tests.helpers.warp_steps import State, Steps
-
-
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    return claw(tmp_path_factory.mktemp("hand"))
-
-
-@pytest.fixture(scope="module")
-def obj() -> ObjectModel:
-    return ball()
 
 
 @pytest.fixture(scope="module")
