@@ -1,4 +1,4 @@
-"""A hand for physics tests: four two-jointed fingers around a palm, written as MJCF; no file of the project needed."""
+"""Hands for physics tests, written as MJCF: four two-jointed fingers around a palm, and two jaws."""
 
 from __future__ import annotations
 
@@ -22,6 +22,15 @@ FINGER = """
   </body>
 </body>
 """
+
+JAWS = """<mujoco model="jaws"><compiler autolimits="true"/><worldbody><body name="palm">
+  <geom type="box" size="0.08 0.03 0.005" pos="0 0 -0.05" mass="0.2"/>
+  <body name="left" pos="-0.02 0 0"><joint name="slide_left" type="slide" axis="1 0 0" range="-0.03 0.02"/>
+    <geom type="box" size="0.005 0.03 0.03" pos="-0.005 0 0" mass="0.1"/></body>
+  <body name="right" pos="0.02 0 0"><joint name="slide_right" type="slide" axis="-1 0 0" range="-0.03 0.02"/>
+    <geom type="box" size="0.005 0.03 0.03" pos="0.005 0 0" mass="0.1"/></body>
+</body></worldbody></mujoco>"""
+"""Two parallel jaws, 4 cm apart at zero."""
 
 
 def claw_xml(fingers: int = 4, radius: float = 0.042) -> str:

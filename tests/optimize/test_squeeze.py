@@ -18,7 +18,7 @@ from dro_grasp.optimize.squeeze import GripConfig, contact_forces, gripping
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import simulate
-from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+from tests.helpers.claw import JAWS, ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.toy_hand import coupled_hand, toy_hand
 
 CONFIG = GripConfig(iterations=2000)
@@ -76,16 +76,6 @@ def test_joint_offsets_do_the_work_of_the_forces() -> None:
         work = float((forces * (ahead - behind) / 2e-6).sum())
         offset = float(made.squeeze_joints[0, joint] - grasps.joints[0, joint])
         assert offset == pytest.approx(work / config.stiffness, abs=2e-5)
-
-
-JAWS = """<mujoco model="jaws"><compiler autolimits="true"/><worldbody><body name="palm">
-  <geom type="box" size="0.08 0.03 0.005" pos="0 0 -0.05" mass="0.2"/>
-  <body name="left" pos="-0.02 0 0"><joint name="slide_left" type="slide" axis="1 0 0" range="-0.03 0.02"/>
-    <geom type="box" size="0.005 0.03 0.03" pos="-0.005 0 0" mass="0.1"/></body>
-  <body name="right" pos="0.02 0 0"><joint name="slide_right" type="slide" axis="-1 0 0" range="-0.03 0.02"/>
-    <geom type="box" size="0.005 0.03 0.03" pos="0.005 0 0" mass="0.1"/></body>
-</body></worldbody></mujoco>"""
-"""Two parallel jaws, 4 cm apart at zero."""
 
 
 def test_servos_of_sliding_jaws_make_half_of_the_force_each_of_their_offsets(tmp_path: Path) -> None:

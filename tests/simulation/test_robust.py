@@ -26,19 +26,10 @@ from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import cached_scene
 from dro_grasp.simulation.trial import record, simulate
-from tests.helpers.claw import grasps_of, power_grasp, wrist_below
+from tests.helpers.claw import JAWS, grasps_of, power_grasp, wrist_below
 
 ROBUST = protocol("robust").perturbations
 NUMBERS = ("success", "displacement", "rotation", "closing_shift", "closing_rotation", "penetration", "fingers_in_contact")
-
-VICE = """<mujoco model="vice"><compiler autolimits="true"/><worldbody><body name="palm">
-  <geom type="box" size="0.08 0.03 0.005" pos="0 0 -0.05" mass="0.2"/>
-  <body name="left" pos="-0.02 0 0"><joint name="slide_left" type="slide" axis="1 0 0" range="-0.03 0.02"/>
-    <geom type="box" size="0.005 0.03 0.03" pos="-0.005 0 0" mass="0.1"/></body>
-  <body name="right" pos="0.02 0 0"><joint name="slide_right" type="slide" axis="-1 0 0" range="-0.03 0.02"/>
-    <geom type="box" size="0.005 0.03 0.03" pos="0.005 0 0" mass="0.1"/></body>
-</body></worldbody></mujoco>"""
-"""Two parallel jaws, 4 cm apart at zero."""
 
 
 def perturbed(name: str = "strict", **changes: object) -> Protocol:
@@ -99,7 +90,7 @@ def test_conditions_in_a_shared_scene_are_those_of_a_scene_compiled_with_them(ha
 @pytest.fixture(scope="module")
 def vice(tmp_path_factory: pytest.TempPathFactory) -> Hand:
     file = tmp_path_factory.mktemp("vice") / "vice.xml"
-    file.write_text(VICE)
+    file.write_text(JAWS)
     return load_hand(file)
 
 
