@@ -1,13 +1,19 @@
-"""Held, empty or slipping, by joints of which everything is known."""
+"""Held, empty, slipping or unexpected, by joints of which everything is known."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from scipy.stats import multivariate_normal, norm
 
 from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.hold import HoldConfig, HoldExpectation, check_hold
+from tests.helpers.claw import ball
+from tests.helpers.toy_hand import toy_hand
 
 EXPECTED = HoldExpectation(
     np.array([0.5, 0.6, 0.4, 0.02]), np.array([0.3, 0.2, 0.25, 8.0]), np.array([0.8, 0.9, 0.55, 0.0]), np.zeros(4),
@@ -24,6 +30,49 @@ def test_the_ends_are_told_apart_and_surely() -> None:
         assert (found.state, found.confidence > 0.9) == (state, True), share
         assert sum(found.probabilities.values()) == pytest.approx(1)
         assert found.confidence == found.probabilities[state]
+
+
+FAR = {"an open hand": between(-4.0), "degrees": np.degrees(EXPECTED.held_joints), "beyond the empty hand": between(2.0),
+       "a dead encoder": between(1.0) * np.array([1.0, 0.0, 1.0, 1.0]), "zeros": np.zeros(4)}
+"""Joints that say nothing of the object."""
+
+
+@pytest.mark.parametrize("what", FAR)
+def test_joints_that_fit_neither_end_are_unexpected(what: str) -> None:
+    """Whatever else is measured: resting there, having been there before, efforts of the squeeze, and a load."""
+    joints, known = FAR[what], replace(EXPECTED, weight=2.0)
+    for more in ({}, {"watched": np.tile(joints, (11, 1))}, {"before": joints}, {"before": EXPECTED.held_joints},
+                 {"measured_efforts": EXPECTED.held_efforts}, {"load": 2.0}):
+        found = check_hold(known, joints, **more)
+        assert (found.state, found.confidence > 0.95) == ("unexpected", True), (what, more)
+
+
+def test_random_postures_are_unexpected() -> None:
+    """Of many joints nearly all; as likely as the rule says: independently, by one joint alone."""
+    rng, many = np.random.default_rng(0), np.ones(16)
+    wide = HoldExpectation(0.5 * many, 0.3 * many, 0.8 * many, 0 * many, many)
+    assert all(check_hold(wide, joints).state == "unexpected" for joints in rng.uniform(-0.5, 1.8, (500, 16)))
+    one = HoldExpectation(*(row[:1] for row in (0.5 * many, 0.3 * many, 0.8 * many, 0 * many, many)))
+    config = HoldConfig()
+    for place in (-2.0, 0.0, 0.3, 0.5, 0.7, 0.8, 1.2):
+        spread = np.hypot(config.encoder, config.spread * 0.3)
+        held = max(norm.pdf(place, 0.5, spread), norm.pdf(place, 0.5, np.hypot(spread, config.slack)))
+        shares = np.linspace(config.unsure, config.slip[1], 10)
+        slips = np.mean(norm.pdf(place, 0.5 + 0.3 * shares, np.hypot(config.encoder, config.spread / 2 * 0.3)))
+        odds = np.array([held, norm.pdf(place, 0.8, config.encoder), slips, 1 / config.anywhere])
+        odds *= [*config.priors, config.doubt]
+        expected = (1 - config.doubt) * odds / odds.sum() + config.doubt / 4
+        assert list(check_hold(one, [place]).probabilities.values()) == pytest.approx(expected, abs=1e-9)
+
+
+def test_what_nobody_expects_cannot_be_checked() -> None:
+    hand = toy_hand()
+    grasps = GraspBatch.create(hand, ball(), torch.eye(4)[None], torch.zeros(1, hand.tree.n_dof))
+    assert HoldExpectation.of(grasps, 0) is None
+    with pytest.raises(OptionError, match="nothing is expected of these grasps; let `expect_hold` find it first"):
+        check_hold(HoldExpectation.of(grasps, 0), [0.0])
+    with pytest.raises(OptionError, match="index is 7, and there are 1 grasps; give one from 0 to 0"):
+        HoldExpectation.of(grasps, 7)
 
 
 def test_noise_of_encoders_changes_nothing() -> None:
@@ -62,7 +111,7 @@ def test_fingers_that_move_while_nothing_is_commanded_let_the_object_slip() -> N
 
 
 def test_exact_encoders_and_many_joints_do_not_overflow() -> None:
-    rows = watched(np.full(4, 1e4), noise=0.0)
+    rows = watched(np.full(4, 1e4), noise=0.0) + 1e3 * EXPECTED.unit  # about where the object is held
     found = check_hold(EXPECTED, rows[-1], watched=rows)
     assert found.state == "slipping"
     assert sum(found.probabilities.values()) == pytest.approx(1)
@@ -177,5 +226,5 @@ def test_moving_joints_are_judged_as_gaussian_processes() -> None:
 
 def test_nothing_is_surer_than_doubt_allows() -> None:
     check = check_hold(EXPECTED, between(0.0), EXPECTED.held_efforts, config=HoldConfig(doubt=0.3))
-    assert check.confidence == pytest.approx(0.8, abs=1e-3)
+    assert check.confidence == pytest.approx(0.7 + 0.3 / 4, abs=1e-3)
     assert sum(check.probabilities.values()) == pytest.approx(1)

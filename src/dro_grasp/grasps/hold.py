@@ -1,8 +1,9 @@
-"""Did it hold? What a robot's joints say after the hand has closed and lifted: held, empty, or slipping.
+"""Did it hold? What a robot's joints say after the hand has closed and lifted: held, empty, slipping, or unexpected.
 
 Fingers that close on an object stop where it is, and press; fingers that close on nothing go on to their targets. Both ends are
 known from closings in simulation (`expect_hold`). Fingers from which an object slips move while it does, and only then: whoever
-watches them for a fifth of a second sees it, unless the object slides along fingers that rest. Ours.
+watches them for a fifth of a second sees it, unless the object slides along fingers that rest. Joints that are far from all of
+this say nothing of the object: the hand has not closed, an encoder fails, or numbers are in other units. Ours.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ HOLD_COLUMNS = ("held_joints", "held_torque", "empty_joints", "empty_torque", "h
 as a radian to each joint: 1, or a length where it slides [m]."""
 WEIGHT_COLUMN = "held_weight"
 """Further column: the object's weight [N]."""
-HoldState = Literal["held", "empty", "slipping"]
-STATES: tuple[HoldState, ...] = ("held", "empty", "slipping")  # In the order of HoldConfig.priors
+HoldState = Literal["held", "empty", "slipping", "unexpected"]
+STATES: tuple[HoldState, ...] = ("held", "empty", "slipping", "unexpected")
+"""In the order of HoldConfig.priors; the last has the probability of its doubt."""
 STEPS = 10  # Shares of the way that are tried for a slipping object (ours)
 ONSETS = (0.0, 0.25, 0.5, 0.7, 0.85)  # Shares of the watched time after which a slip may begin (ours)
 FEWEST = 4  # Fewest rows of joints that show how fast they move (ours)
-MOST = 50.0  # Largest log-likelihood ratio of one joint (ours)
+MOST = 50.0  # Largest log-likelihood ratio of one joint that moves, and of all (ours)
 STEADY = 1e-3  # Least noise of encoders [rad, or a share of a sliding joint's unit] (ours): no number is exact
-SPREADS = ("encoder", "sensor", "spread", "slack", "creep", "slide", "scale", "heavy")  # Of HoldConfig
+SPREADS = ("encoder", "sensor", "spread", "slack", "anywhere", "creep", "slide", "scale", "heavy")  # Of HoldConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,13 @@ class HoldExpectation:
 
     @staticmethod
     def of(grasps: GraspBatch, index: int) -> HoldExpectation | None:
-        """Those of one grasp; None where `expect_hold` has not been asked."""
+        """Those of one grasp; None where `expect_hold` has not been asked.
+
+        Raises:
+            OptionError: There is no grasp of this index.
+        """
+        if not -len(grasps) <= index < len(grasps):
+            raise OptionError(f"index is {index}, and there are {len(grasps)} grasps; give one from 0 to {len(grasps) - 1}")
         if not all(name in grasps.extra for name in HOLD_COLUMNS):
             return None
         rows = [grasps.extra[name][index].double().numpy() for name in HOLD_COLUMNS]
@@ -74,6 +82,8 @@ class HoldConfig(Checked):
     """Standard deviation of where fingers stop on the object, as a share of the way from there to where an empty hand does."""
     slack: float = 0.02
     """The same where there is no way: the object stands some millimetres off [rad, or likewise]."""
+    anywhere: float = 4.0
+    """Width of the range in which joints are of which nothing is known [rad, or likewise]."""
     slip: tuple[float, float] = (0.15, 0.9)
     """Shares of the way from where they were to the empty hand's joints that fingers have gone when an object slips [1]."""
     unsure: float = 0.5
@@ -87,7 +97,7 @@ class HoldConfig(Checked):
     share: float = 0.8
     """Share of the joints that do."""
     doubt: float = 0.02
-    """Probability that none of this is true, and all states are as likely."""
+    """Probability that joints are unexpected, and that none of this is true, and all states are as likely."""
     scale: float = 0.6
     """Standard deviation of measured loads [N]. Source: ten weighings with a wrist sensor (forum.universal-robots.com, thread
     229); sensors inside arms are six times worse."""
@@ -114,7 +124,7 @@ class HoldCheck:
 
     state: HoldState
     """The most probable state: *held* is what rests in the hand, *slipping* what has left its place by a centimetre or more and
-    goes on at 2 cm/s or more; *empty* is a hand that has closed on nothing."""
+    goes on at 2 cm/s or more; *empty* is a hand that has closed on nothing; *unexpected* are joints that fit none of these."""
     confidence: float
     """Its probability."""
     probabilities: dict[str, float]
@@ -122,21 +132,22 @@ class HoldCheck:
 
 
 def check_hold(
-    expected: HoldExpectation, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *,
+    expected: HoldExpectation | None, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *,
     before: ArrayLike | None = None, watched: ArrayLike | None = None, seconds: float = 0.2, load: float | None = None,
     config: HoldConfig | None = None,
 ) -> HoldCheck:
     """Compare measured joints, and efforts if there are any, with those that are expected with the object and without.
 
     Measure after the lift, best for a fifth of a second (`watched`). Where joints end at the same place with the object and
-    without, the confidence is low, and efforts or a load are needed. Slow motion of the object
-    is neither held nor slipping.
+    without, the confidence is low, and efforts or a load are needed. Slow motion of the object is neither held nor slipping. An
+    unexpected hand is open, broken, or measured in other units: look at it.
 
     Args:
         expected: What to expect, of a plan (`MotionPlan.hold`) or of grasps (`HoldExpectation.of`).
         measured_joints: Independent joints of the hand, in its order, (n_dof) [rad or m].
         measured_efforts: What they exert, likewise [Nm or N], positive toward larger values.
         before: Joints as they were measured while the object was held, likewise: how they moved since shows that it slips.
+            Where they are unexpected themselves, so is what came of them.
         watched: Joints that were measured one after the other at even times while nothing was commanded, up to now,
             (k, n_dof), 4 rows at least: that they move shows that it slips. Where they are is their mean.
         seconds: Time from the first to the last of these [s].
@@ -144,24 +155,34 @@ def check_hold(
         config: Spreads.
 
     Raises:
-        OptionError: Measurements have another shape, or are not finite; a load is given, and no weight is expected.
+        OptionError: Nothing is expected; measurements have another shape, or are not finite; a load is given, and no weight is
+            expected.
     """
+    if expected is None:
+        raise OptionError("nothing is expected of these grasps; let `expect_hold` find it first")
     config, size = config or HoldConfig(), len(expected.held_joints)
     joints, held = _measured("measured_joints", measured_joints, size), expected.held_joints
     noise, start = config.encoder * expected.unit, None if before is None else _measured("before", before, size)
     rows = None if watched is None else _rows(watched, seconds, size)
     joints = joints if rows is None else rows.mean(0)
-    total = _log_likelihoods(joints, held, expected.empty_joints, noise, config.slack * expected.unit, start, config)
+    slack = config.slack * expected.unit
+    total = _log_likelihoods(joints, held, expected.empty_joints, noise, slack, start, config)
+    other = _anywhere(expected.unit, config)
+    if start is not None:
+        other += _anywhere(expected.unit, config)
+        total = total + _log_likelihoods(start, held, expected.empty_joints, noise, slack, None, config)[0]
     if measured_efforts is not None:
         efforts = _measured("measured_efforts", measured_efforts, size)
         noise = np.full(size, config.sensor * max(float(np.abs(expected.held_efforts).max()), 1e-9))
-        total = total + _log_likelihoods(efforts, expected.held_efforts, expected.empty_efforts, noise, 0 * noise, None, config)
+        told = _log_likelihoods(efforts, expected.held_efforts, expected.empty_efforts, noise, 0 * noise, None, config)
+        total, other = total + told, other + float(told.max())
     if load is not None:
-        total = total + _weighed(load, expected.weight, len(total), config)
+        told = _weighed(load, expected.weight, len(total), config)
+        total, other = total + told, other + float(told[2])
     slipping = float(np.logaddexp.reduce(total[2:])) - math.log(len(total) - 2)
     if rows is not None:  # where fingers are says little then: a slip begins where the object is held
-        slipping = float(max(total[0], total[1])) + _moves(rows / expected.unit, seconds, config)
-    odds = np.array([total[0], total[1], slipping]) + np.log(config.priors)
+        slipping = float(max(total[0], total[1])) + min(MOST, _moves(rows / expected.unit, seconds, config))
+    odds = np.array([total[0], total[1], slipping, other]) + np.log([*config.priors, config.doubt])
     likely = np.exp(odds - np.logaddexp.reduce(odds))
     chances = ((1 - config.doubt) * likely + config.doubt / len(STATES)).tolist()
     best = max(range(len(STATES)), key=chances.__getitem__)
@@ -224,6 +245,11 @@ def _gaussian(columns: Float[np.ndarray, "k n"], covariance: Float[np.ndarray, "
     """Log-likelihood of each column, but for a constant."""
     root = np.linalg.cholesky(covariance)
     return -(np.linalg.solve(root, columns) ** 2).sum(0) / 2 - np.log(np.diag(root)).sum()
+
+
+def _anywhere(unit: Float[np.ndarray, " n"], config: HoldConfig) -> float:
+    """Log-likelihood of joints that may be anywhere, as `_log_likelihoods` has it: but for a constant of each joint."""
+    return float((math.log(2 * math.pi) / 2 - np.log(config.anywhere * unit)).sum())
 
 
 def _log_likelihoods(

@@ -256,6 +256,13 @@ def test_what_is_no_bin_and_no_number_is_refused(wrong: Any, told: str) -> None:
         wrong()
 
 
+def test_a_bin_that_no_arm_reaches_is_refused_before_anything_moves(robot: dro.Robot) -> None:
+    table = Table(robot, [])
+    with pytest.raises(PlanError, match=r"above the bin's middle, is 4\.\d+ m from the base, farther than the arm and hand"):
+        clear_table(robot, table, NOBODY, ClearConfig(Bin((3.0, 3.0))))
+    assert table.looks == 0
+
+
 @pytest.mark.parametrize("lacking", ["table", "camera"])
 def test_a_table_and_a_camera_are_needed(robot: dro.Robot, lacking: str) -> None:
     can = dro.load_object("can")

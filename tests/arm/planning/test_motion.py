@@ -181,6 +181,16 @@ def test_a_plan_says_what_to_expect_of_the_hold_and_checks_it(planned: MotionPla
         assert messages[name]["name"] == list(planned.notes.hand_joints)
         np.testing.assert_allclose(messages[name]["position"], joints, atol=1e-6)
         np.testing.assert_allclose(messages[name]["effort"], efforts, atol=1e-6)
+    count = len(planned.notes.arm_joints) + len(expected.held_joints)
+    scales = tuple(np.resize([57.3, -1.0, 1000.0], count).tolist())
+    driven = replace(planned, notes=replace(planned.notes, zeros=(0.2,) * count, scales=scales))
+    read = yaml.load(dro.trajectory_yaml(driven), yaml.CSafeLoader)
+    for state in ("held", "empty"):
+        rows = np.tile(read[state]["position"], (11, 1))
+        assert driven.check_hold(rows[-1], read[state]["effort"], watched=rows, from_drivers=True).state == state
+        assert driven.check_hold(rows[-1]).state == "unexpected", "numbers of drivers are no radians"
+    np.testing.assert_allclose(driven.check_hold(read["held"]["position"], from_drivers=True).probabilities["held"],
+                               planned.check_hold(expected.held_joints).probabilities["held"], atol=1e-6)
     before = replace(planned, notes=replace(planned.notes, hold=None))
     assert before.hold is None
     with pytest.raises(dro.DroGraspError, match="plan again"):

@@ -11,7 +11,7 @@ import torch
 import yaml
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.export.writers import Frame, csv_table, dexgraspbench, isaac_grasp
+from dro_grasp.grasps.export.writers import Frame, csv_table, dexgraspbench, isaac_grasp, moveit_grasps
 from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.hands.hand import Hand
 from tests.grasps.export.test_forces import posed
@@ -50,8 +50,15 @@ def test_expected_joints_and_efforts_are_in_every_file_that_has_a_place_for_them
     assert [float(one[f"held_torque:{joint}"]) for joint in names] == [0.2] * len(names)
     assert (one["held_weight"], other["held_weight"]) == ("1.5", "")
     assert {other[f"held_torque:{joint}"] for joint in names} == {""}
+    text = moveit_grasps(told, hand, Frame())
+    lines = [line for line in text.splitlines() if line.startswith("# grasp_")]
+    assert lines == [f"# grasp_0 {name}: {', '.join([str(round(0.1 * (k + 1), 7))] * len(names))}"
+                     for k, name in enumerate(HOLD_COLUMNS[:4])]
+    usual = yaml.safe_load(moveit_grasps(posed(hand, 2), hand, Frame()))
+    assert [set(message) for message in yaml.safe_load(text)] == [set(message) for message in usual]
 
 
 def test_files_of_grasps_that_nobody_simulated_say_nothing(hand: Hand) -> None:
     grasps = posed(hand, 2)
-    assert "held_joints" not in isaac_grasp(grasps, Frame(), hand) + csv_table(grasps, Frame(), hand)
+    assert "held_joints" not in isaac_grasp(grasps, Frame(), hand) + csv_table(grasps, Frame(), hand) + moveit_grasps(
+        grasps, hand, Frame())

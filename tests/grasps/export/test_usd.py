@@ -19,6 +19,7 @@ from dro_grasp.grasps.controller import complete
 from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.export.usd import usd_file
 from dro_grasp.grasps.export.writers import Frame
+from dro_grasp.grasps.hold import HOLD_COLUMNS
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -52,7 +53,8 @@ def grasps(hand: Hand, obj: ObjectModel) -> GraspBatch:
     made = GraspBatch.create(
         hand, obj, T, hand.random_joints(COUNT, generator), score=torch.tensor([2.0, 0.0, torch.nan]),
         payload=torch.tensor([0.5, torch.nan, torch.nan]), squeeze_torque=effort,
-        success=torch.tensor([True, False, False]), protocol=("carry", "carry", ""))
+        success=torch.tensor([True, False, False]), protocol=("carry", "carry", ""),
+        extra={name: torch.full((COUNT, len(hand.tree.joint_names)), 0.1 * k) for k, name in enumerate(HOLD_COLUMNS)})
     return complete(hand, made, torch.zeros(3))
 
 
@@ -112,6 +114,8 @@ def test_numbers_are_stated_where_they_are_known(stage: Any, grasps: GraspBatch)
     for name in ("pregrasp_joints", "squeeze_joints"):
         np.testing.assert_allclose(first[name], getattr(grasps, name)[0], atol=1e-6)
     np.testing.assert_allclose(first["grasp_joints"], grasps.joints[0], atol=1e-6)
+    for k, name in enumerate(HOLD_COLUMNS[:4]):
+        np.testing.assert_allclose(first[name], 0.1 * k, atol=1e-6)
     assert first["confidence"] == pytest.approx(1 / (1 + np.exp(-2.0)), abs=1e-6)
     assert (first["success"], second["success"], first["protocol"]) == (True, False, "carry")
     assert (first["payload"], set(first) - set(second)) == (0.5, {"payload"})

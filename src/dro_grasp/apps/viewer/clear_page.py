@@ -164,7 +164,7 @@ def now(record: ClearRecord, moment: int) -> str:
     if coming is None:
         return "  \n".join(["**Nothing is left to pick**", *map(in_words, happened)])
     checks, (x, y) = [event for event in happened if isinstance(event, Judgement)], coming.place
-    if checks and checks[-1].state != "held":
+    if checks and checks[-1].state in ("empty", "slipping"):
         doing = "The hand opens, and the arm goes home; then the camera looks again"
     else:
         doing = (f"Going for the thing at ({x:.2f}, {y:.2f}) m", "Carrying it to the bin", "Letting it go, and going home")[

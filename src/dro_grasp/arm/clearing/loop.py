@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from dro_grasp.arm.clearing.parts import parted
 from dro_grasp.arm.clearing.picks import Memory, Outcome, Pick
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
-from dro_grasp.arm.planning.placing import Place
+from dro_grasp.arm.planning.placing import Place, check_reach
 from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.arm.planning.trajectory import free_motion, smooth, standing, still
@@ -153,10 +153,13 @@ def clear_table(
     Raises:
         OptionError: The robot has no table or no camera.
         RobotError: It collides where it stands.
-        PlanError: The arm does not find its way home.
+        PlanError: The arm does not reach the bin, or does not find its way home.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
     robot.require_table()
+    assert robot.table is not None
+    above = (*config.bin.centre, robot.table.height + config.bin.height + config.drop)
+    check_reach(robot, np.array(above), "where things are let go, above the bin's middle,")
     memory, picks, moved = Memory(config.tries), list[Pick](), None
     tell = progress or (lambda pick: None)
     while True:
@@ -245,7 +248,10 @@ def _carry_out(
     robot: Robot, rig: Rig, seen: PickedObject, place: tuple[float, float], made: MotionPlan, config: ClearConfig,
     judged: Callable[[HoldCheck], None] | None,
 ) -> Outcome:
-    """Follow a plan to the bin; what slips as it is lifted is put back, and what is lost is left where it fell."""
+    """Follow a plan to the bin; what slips as it is lifted is put back, and what is lost is left where it fell.
+
+    Joints that fit neither say nothing of the object: the arm goes on, and the camera sees what came of it.
+    """
     assert seen.robot.table is not None
     around = [*seen.obstacles, config.bin.walls(seen.robot.table.height)]
     cloud = seen.obj.cloud if seen.obj.seen is None else seen.obj.seen

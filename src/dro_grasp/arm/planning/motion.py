@@ -183,9 +183,13 @@ class MotionPlan:
 
     def check_hold(
         self, measured_joints: ArrayLike, measured_efforts: ArrayLike | None = None, *, before: ArrayLike | None = None,
-        watched: ArrayLike | None = None, seconds: float = 0.2, load: float | None = None,
+        watched: ArrayLike | None = None, seconds: float = 0.2, load: float | None = None, from_drivers: bool = False,
     ) -> HoldCheck:
-        """Whether the hand holds the object, has lost it, or is losing it; arguments as for `dro_grasp.check_hold`.
+        """Whether the hand holds the object, has lost it, or is losing it; see `dro_grasp.check_hold` for the arguments.
+
+        Args:
+            from_drivers: Measurements are as the robot's drivers count them, by `zeros`, `signs` and `units` of its file, and
+                as files of trajectories state them. Without it they are those of the description [rad or m; Nm or N].
 
         Raises:
             OptionError: Measurements have another shape, or are not finite; a load is given, and the plan states no weight.
@@ -193,6 +197,8 @@ class MotionPlan:
         """
         if (expected := self.hold) is None:
             raise PlanError("the plan does not state what joints to expect, as plans of before; plan again")
+        if from_drivers:
+            expected = self.drivers[1].holding(expected)
         return check_hold(
             expected, measured_joints, measured_efforts, before=before, watched=watched, seconds=seconds, load=load)
 
@@ -329,10 +335,11 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
             "position": _plain(of_hand.positions(plan.squeeze)),
             "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
     if hold is not None:
-        for name, joints, forces in (("held", hold.held_joints, hold.held_efforts),
-                                     ("empty", hold.empty_joints, hold.empty_efforts)):
+        driven = of_hand.holding(hold)
+        for name, joints, forces in (("held", driven.held_joints, driven.held_efforts),
+                                     ("empty", driven.empty_joints, driven.empty_efforts)):
             messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
-                              "position": _plain(of_hand.positions(joints)), "effort": _plain(of_hand.efforts(forces))}
+                              "position": _plain(joints), "effort": _plain(forces)}
     units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
     does = "pushes" if notes.slide is not None else "lifts" if notes.place is None else "lifts and places"
     return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dro_grasp.arm.planning.workcell import SINK, TABLE, VOXEL, Workcell
-from dro_grasp.arm.robots.robot import Table
+from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.table_plane import moved_plane
@@ -32,6 +32,14 @@ LEVEL = 0.98  # Least cosine between a table's normal and the vertical [1] (ours
 FLOATS = 0.1  # Greatest height of a cloud's lowest point above what it stands on [m] (ours)
 GAP = 0.01  # Farthest that an object may stand above what carries it [m] (ours): a release from there tips most of them over
 TOP = 0.01  # Points of a thing within this depth below its highest are its top [m] (ours)
+
+
+def check_reach(robot: Robot, spot: Float[np.ndarray, "3"], where: str) -> None:
+    """Refuse a spot of the world [m] that no hand of the robot reaches, by a PlanError."""
+    distance, longest = float(np.linalg.norm(spot - robot.T_world_base[:3, 3])), robot.longest_reach
+    if distance > longest:
+        raise PlanError(f"{where} is {distance:.2f} m from the base, farther than the arm and hand are long "
+                        f"({longest:.2f} m); give a place in the robot's world frame [m]")
 
 
 @dataclass(frozen=True)
@@ -171,7 +179,7 @@ class Placing:
         """Motions to one spot, or a PlanError that says why there are none."""
         x, y, z = spot
         where = f"the place ({x:.3f}, {y:.3f}, {z:.3f}) m"
-        self._check_reach(spot, where)
+        check_reach(self.cell.robot, spot, where)
         table = self.cell.robot.table
         if table is not None and z < table.height - SINK:
             raise PlanError(f"{where} is {100 * (table.height - z):.1f} cm below the table at {table.height:.3f} m; give the "
@@ -183,13 +191,6 @@ class Placing:
         if self._beside(self._motion(spot - (0, 0, GAP + self.place.falls + self._floats), self._yaw(found[0]))).depth == 0.0:
             self._refuse_air(spot, where)
         return found
-
-    def _check_reach(self, spot: Float[np.ndarray, "3"], where: str) -> None:
-        robot = self.cell.robot
-        distance, longest = float(np.linalg.norm(spot - robot.T_world_base[:3, 3])), robot.longest_reach
-        if distance > longest:
-            raise PlanError(f"{where} is {distance:.2f} m from the base, farther than the arm and hand are long "
-                            f"({longest:.2f} m); give a place in the robot's world frame [m]")
 
     def _refuse_air(self, spot: Float[np.ndarray, "3"], where: str) -> None:
         """Say what is wrong with a spot that nothing carries."""

@@ -1,7 +1,8 @@
 """A plan as the stages of a task, for MoveIt Task Constructor and others that plan the motions between them anew.
 
 Each stage has the name of a class of MoveIt Task Constructor as `type`, and the values that its setters take. Joints are those
-of the robot's description. Source: MoveIt Task Constructor, stages MoveTo, MoveRelative and ModifyPlanningScene.
+of the robot's description. The stage that closes the hand also states what to expect of its joints after the lift, with the
+object and without, as `expected`. Source: MoveIt Task Constructor, stages MoveTo, MoveRelative and ModifyPlanningScene.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
         _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
         {"name": "hand may touch", "type": "ModifyPlanningScene", **allowed},
         *_straight("approach", plan, robot, "approach"),
-        _joints("close", HAND, hand, plan.squeeze, plan.notes.squeeze_torque),
+        _joints("close", HAND, hand, plan.squeeze, plan.notes.squeeze_torque) | _expected(plan, hand),
         {"name": "attach", "type": "ModifyPlanningScene", "attach_objects": {"objects": [thing], "link": wrist}},
         *_straight("lift", plan, robot, "lift"),
     ]
@@ -76,6 +77,15 @@ def _joints(
     """A motion to joints."""
     stage: dict[str, Any] = {"name": name, "type": "MoveTo", "group": group, "goal": {"joints": _named(names, values)}}
     return stage if effort is None else stage | {"effort": _named(names, np.array(effort))}
+
+
+def _expected(plan: MotionPlan, names: tuple[str, ...]) -> dict[str, Any]:
+    """What to expect of a hold; nothing in plans that do not know."""
+    if (known := plan.hold) is None:
+        return {}
+    ends = (("held", known.held_joints, known.held_efforts), ("empty", known.empty_joints, known.empty_efforts))
+    return {"expected": {state: {"joints": _named(names, joints), "effort": _named(names, efforts)}
+                         for state, joints, efforts in ends}}
 
 
 def _pose(name: str, plan: MotionPlan, robot: Robot, stage: str) -> dict[str, Any]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+
+from dro_grasp.grasps.hold import HoldExpectation
 
 ANGLES = {"rad": 1.0, "deg": math.degrees(1.0), "turn": 0.5 / math.pi}  # Units of joints that turn, in a radian
 LENGTHS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}  # Units of joints that slide, in a metre
@@ -50,6 +52,13 @@ class Drivers:
     def efforts(self, efforts: Float[np.ndarray, "*k n"]) -> Float[np.ndarray, "*k n"]:
         """Efforts with the drivers' signs; they stay in Nm or N."""
         return efforts * np.sign(self.scales)
+
+    def holding(self, expected: HoldExpectation) -> HoldExpectation:
+        """What to expect of a hand, in the numbers of its drivers, for what the description says."""
+        return replace(
+            expected, held_joints=self.positions(expected.held_joints), held_efforts=self.efforts(expected.held_efforts),
+            empty_joints=self.positions(expected.empty_joints), empty_efforts=self.efforts(expected.empty_efforts),
+            unit=expected.unit * np.abs(self.scales))
 
     def lines(self, names: tuple[str, ...]) -> list[str]:
         """Each joint that its driver counts otherwise, in words."""

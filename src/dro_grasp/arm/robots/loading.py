@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
+FARTHEST_ZERO = 10.0  # Largest stated zero of a driver of a joint that slides [m] (ours); of one that turns it is a turn
 HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
 
 
@@ -93,10 +95,19 @@ def _drivers(file: RobotFile, arm: Description, hand: Hand) -> Drivers:
     for key, stated in file.drivers.items():
         if unknown := [str(name) for name in stated if name not in called]:
             raise file.error(f"{key} names joint '{unknown[0]}'; the joints of arm and hand are {', '.join(called)}")
-    zeros = [file.number(file.drivers["zeros"].get(name, 0.0), f"zeros of joint {name}") for name in called]
+    zeros = [_zero(file, name, turn) for name, turn in zip(called, turns, strict=True)]
     scales = [_sign(file, name) * _unit(file, name, ANGLES if turn else LENGTHS)
               for name, turn in zip(called, turns, strict=True)]
     return Drivers(tuple(zeros), tuple(scales))
+
+
+def _zero(file: RobotFile, name: str, turns: bool) -> float:
+    zero = file.number(file.drivers["zeros"].get(name, 0.0), f"zeros of joint {name}")
+    if abs(zero) > (farthest := 2 * math.pi if turns else FARTHEST_ZERO):
+        unit, other = ("rad", "degrees") if turns else ("m", "millimetres")
+        raise file.error(f"zeros of joint {name} is {zero:g} {unit}, as of {other}; expected at most {farthest:.4g} {unit}, in "
+                         "which the description counts")
+    return zero
 
 
 def _sign(file: RobotFile, name: str) -> float:

@@ -21,7 +21,7 @@ from dro_grasp.extras import require_extra
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Colour
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.formats import ExportJob
-from dro_grasp.grasps.export.writers import Frame, comment, confidence, forces, plain, postures
+from dro_grasp.grasps.export.writers import Frame, comment, confidence, forces, hold, plain, postures
 from dro_grasp.grasps.forces import efforts_of, squeeze_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -160,6 +160,8 @@ def _state(
         add(f"{posture}_joints", kinds.DoubleArray, plain(values))
     if effort is not None:
         add("squeeze_effort", kinds.DoubleArray, plain(effort))
+    for name, row in hold(grasps, i).items():
+        add(name, kinds.DoubleArray, plain(row))
     numbers: dict[str, float | None] = {"confidence": confidence(grasps, i), **forces(grasps, i)}
     for name, value in numbers.items():
         if value is not None:

@@ -191,8 +191,9 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
     """A YAML list of moveit_msgs/Grasp, with the wrist link's pose, the fingers' postures and the efforts of the squeeze.
 
     The hand approaches along its palm direction and retreats along z of the frame, which is up in a robot's base. A grasp
-    without a score has no `grasp_quality`, and one without known efforts an empty `effort`. Payloads, which have no place in
-    it, stand in a comment. Source: moveit_msgs/Grasp of MoveIt 2, whose `grasp_posture` is of positions and efforts.
+    without a score has no `grasp_quality`, and one without known efforts an empty `effort`. Payloads and HOLD_COLUMNS, which
+    have no place in it, stand in comments. Source: moveit_msgs/Grasp of MoveIt 2, whose `grasp_posture` is of positions and
+    efforts.
     """
     position, quaternion = frame.place(grasps)
     joints, efforts = postures(grasps), squeeze_efforts(grasps, hand)
@@ -213,7 +214,7 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
             "post_place_retreat": _path(at_wrist, -palm, RETREAT),
             "max_contact_force": forces(grasps, i).get("squeeze_force", NO_LIMIT), "allowed_touch_objects": [grasps.object[i]],
         })
-    return comment(grasps, frame) + _payloads(grasps) + yaml_text(messages)
+    return comment(grasps, frame) + _payloads(grasps) + _holds(grasps) + yaml_text(messages)
 
 
 def _payloads(grasps: GraspBatch) -> str:
@@ -222,6 +223,12 @@ def _payloads(grasps: GraspBatch) -> str:
         return ""
     told = (str(forces(grasps, i).get("payload", "unknown")) for i in range(len(grasps)))
     return f"# Payload of each grasp in kg: {', '.join(told)}\n"
+
+
+def _holds(grasps: GraspBatch) -> str:
+    """Comment lines with what to expect of a hold: for each grasp one for each of HOLD_COLUMNS, in the order of the joints."""
+    return "".join(f"# grasp_{i} {name}: {', '.join(map(str, plain(row)))}\n"
+                   for i in range(len(grasps)) for name, row in hold(grasps, i).items())
 
 
 def _posture(
