@@ -33,6 +33,20 @@ def test_two_boxes_that_touch_are_two(other: Box, view: int) -> None:
     assert min(asked(made, part=True)) > 0.85
 
 
+@pytest.mark.parametrize("view", range(2))
+@pytest.mark.parametrize("height", [0.11, 0.1])
+def test_two_cans_side_by_side_are_two_though_their_tops_are_in_line(height: float, view: int) -> None:
+    """The seam between their sides ends at the tops: an upright cut goes on along it. From above it is too short to be told."""
+    meshes = [trimesh.creation.cylinder(radius=0.033, height=own) for own in (0.11, height)]
+    for mesh, x in zip(meshes, (0.0, 0.067), strict=True):
+        mesh.apply_translation((x, 0.0, -mesh.bounds[0, 2]))
+    made = render_scene("table", meshes, ("can", "can"), np.random.default_rng(0), view)
+    scene = made.load()
+    assert scene.segments.count == 1
+    assert any("part=True" in note for note in scene.chosen().notes)
+    assert min(asked(made, part=True)) > 0.9
+
+
 @pytest.mark.parametrize("view", range(3))
 def test_two_boxes_with_a_gap_between_them_are_two(view: int) -> None:
     made = _scene((LOW, APART), view)

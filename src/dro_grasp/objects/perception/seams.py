@@ -14,6 +14,12 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 CONCAVE = 0.35  # Sine of the angle between normals that turn towards each other at a seam [1] (ours)
 BREAK = 1.5  # Distance of neighbours across a gap, in cubes or usual distances [1] (ours): on an even surface they are nearer
 ACROSS = 0.6  # Cosine between a gap and the ray to it below which it is seen across [1] (ours)
+WALL = 0.008  # Distance from an upright cut within which a seam runs along it [m] (ours)
+ALONG = 0.75  # Share of the seam's cubes that do, at least (ours)
+SHARED = 0.9  # Most cubes beside the seam that it may cut through, over those of the seam [1] (ours)
+TALL = 0.02  # Least height of such a seam [m] (ours)
+BROAD = 0.0015  # Its least area [m^2] (ours): smaller ones run over single things, too
+CUTS = 24  # Directions of upright cuts that are tried (ours)
 PART = 0.1  # Share of a thing that each side of a seam has, at least [1] (ours)
 LEAST_PART = 24  # Filled cubes of each, at least (ours): as of a thing
 FOOT = 0.03  # Height above a plane up to which a part is seen to stand on it [m] (ours): cubes below 2 cm may be the plane's
@@ -62,11 +68,13 @@ def parted(
     Parts that a seam divides may be things of their own if at least two of them reach down to a plane, or may do so out of
     sight, and they are not within each other. The concave edges are those of Stein et al. 2014; the rest is ours.
     """
-    sides = _sides(surface, own)
+    sides = _sides(surface, own, levels)
     return (_standing(surface, own, _beside(surface.cells[own], sides), levels), True) if sides.any() else (sides, False)
 
 
-def _sides(surface: Surface, own: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
+def _sides(
+    surface: Surface, own: Int[np.ndarray, " o"], levels: list[Float[np.ndarray, "4"]]
+) -> Int[np.ndarray, " o"]:
     """The parts into which a thing falls where its surface turns inward, or breaks off."""
     place = np.full(len(surface.cells), -1)
     place[own] = np.arange(len(own))
@@ -89,7 +97,27 @@ def _sides(surface: Surface, own: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"
         large = np.flatnonzero(np.bincount(part) >= max(PART * len(own), LEAST_PART))
         if len(large) > 1:
             return _nearest(cells, part, large)
-    return np.zeros(len(own), int)
+    run = joined(mine[seam[mine].all(1)], len(own))
+    longest = seam & (run == np.bincount(run, seam).argmax())
+    return _cut(cells, longest, levels) if longest.sum() * surface.edge**2 > BROAD else np.zeros(len(own), int)
+
+
+def _cut(
+    cells: Float[np.ndarray, "o 3"], seam: Bool[np.ndarray, " o"], levels: list[Float[np.ndarray, "4"]]
+) -> Int[np.ndarray, " o"]:
+    """The two sides of an upright cut along a seam, which ends where faces of two things lie in line."""
+    whole = np.zeros(len(cells), int)
+    if not levels or np.ptp(cells[seam] @ (up := levels[0][:3])) < TALL:
+        return whole
+    flat = cells @ np.linalg.svd(up[None])[2][1:].T
+    angle = np.pi * np.arange(CUTS) / CUTS
+    off = (flat - np.median(flat[seam], axis=0)) @ np.stack([np.cos(angle), np.sin(angle)])
+    near = np.abs(off) < WALL
+    # Where least else is cut: two things share less than the seam between them, and one is whole below its neck.
+    cut = np.where(near[seam].mean(0) < ALONG, np.inf, near[~seam].sum(0) / seam.sum())
+    side = off[:, cut.argmin()] > 0
+    small = min(side.sum(), (~side).sum()) < max(PART * len(cells), LEAST_PART)
+    return whole if cut.min() > SHARED or small else side.astype(int)
 
 
 def _nearest(
