@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
+from dro_grasp.objects.perception.raised import joined_rest, raised
 from dro_grasp.objects.perception.segmentation import BACK, NOTHING, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
@@ -28,6 +29,7 @@ TOLD = 8  # Things that a message lists (ours)
 ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
 PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
 LEAST_MASK = 60  # Fewest points in a mask (ours)
+SLIVER = 0.1  # Share of a mask's points below which a thing that is mostly beside it is not meant [1] (ours)
 COVERED = 0.5  # Share of a plane's points in a mask from which the plane is a face of the object [1] (ours)
 SECOND = 0.5  # Share of another thing's points in a mask from which it is told that the thing is left out [1] (ours)
 JOINED = 0.015  # Distance of a thing's top from the edge of a level face up to which it ends there [m] (ours)
@@ -92,8 +94,8 @@ def choose(
                           "(pixel=(U, V)) which")
     if mask is not None:
         inside = within(name, sight, mask)
-        own = _masked(name, sight, segments, inside)
-        return _chosen(sight, segments, own, _left_out(sight, segments, inside, own))
+        own, notes, higher = _masked(name, sight, segments, inside)
+        return _chosen(sight, segments, own, (*notes, *_left_out(sight, segments, inside, own)), higher)
     if not segments.count:
         raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
                           "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
@@ -253,15 +255,56 @@ def all_within(name: str, sight: Sight, segments: Segments, mask: Any) -> Chosen
     return _chosen(sight, segments, np.flatnonzero(within(name, sight, mask)), ())
 
 
-def _masked(name: str, sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+def _masked(
+    name: str, sight: Sight, segments: Segments, inside: Bool[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " k"], tuple[str, ...], bool]:
+    """The points of the object that a mask shows, what to say of them, and whether they are of no thing that stands out."""
     plane = _plane_of(sight, segments)
-    faces = _faces(sight, segments, plane, inside)
-    own = np.flatnonzero(inside & ((plane < 0) | faces[plane]))
+    own = _standing_out(sight, segments, plane, inside)
+    faces, rest = raised(sight, segments, plane, inside)
+    parts, whole = (np.bincount(segments.labels[(segments.labels >= 0) & rows], minlength=max(1, segments.count))
+                    for rows in (inside, np.ones(len(inside), bool)))
+    most = int(parts.argmax())
+    if (parts <= COVERED * whole).all():  # no thing is in the mask for the most part
+        instead = joined_rest(sight.points, faces, rest)
+        new = LEAST_MASK if not parts.any() else 1  # without a thing, what is on no plane counts in any case
+        if (len(instead) >= max(LEAST_MASK, parts[most] + 1, SLIVER * inside.sum())
+                and len(np.setdiff1d(instead, own)) >= new):
+            return instead, (_raised_note(segments, instead),), True
+        if len(own) >= LEAST_MASK and 0 < parts[most] < SLIVER * inside.sum():
+            place = place_of(sight.world()[segments.labels == most])
+            raise ObjectError(f"the mask lies beside what stands out: {parts[most]} of its {inside.sum()} points are on a "
+                              f"thing, and of this one, at {place}, most is beside the mask ({parts[most]} of {whole[most]} "
+                              "points are in it). All others are on tables, walls, or what is too large to be meant; give a "
+                              f"mask that is true on all that is seen of the object. '{name}' shows {listed(sight, segments)}")
     if len(own) < LEAST_MASK:
         flat = "" if inside.sum() < LEAST_MASK else (
             " (what lies too flat to stand out is taken from a robot's table only, by pick_object or `dro-grasp plan --mask`)")
         raise ObjectError(f"the mask has {len(own)} points that stand out of tables and walls, and at least {LEAST_MASK} are "
                           f"needed; give one that is true on the object{flat}. '{name}' shows {listed(sight, segments)}")
+    return own, _higher_note(np.setdiff1d(np.flatnonzero(faces), own), own), False
+
+
+def _raised_note(segments: Segments, own: Int[np.ndarray, " k"]) -> str:
+    on = int((segments.labels[own] == STRUCTURE).sum())
+    return ("no thing that stands out by itself is in the mask for the most part, so what the mask shows that is higher than "
+            f"its surroundings counts: {len(own)} points, {on} of them on what looks like a table, a board or a wall. If that is "
+            "not the object, give a mask that is true on all of the object, and on nothing else")
+
+
+def _higher_note(faces: Int[np.ndarray, " m"], own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
+    """A note where most of what a mask shows is a raised face that counts as a board."""
+    return (f"the mask also shows a face that is higher than its surroundings and looks like a board or a wall ({len(faces)} "
+            f"points), which is an obstacle: {len(own)} points count as the object. If the face is a part of it, give a mask "
+            "that is true on the object, and on nothing else",) if len(faces) > len(own) else ()
+
+
+def _standing_out(
+    sight: Sight, segments: Segments, plane: Int[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]
+) -> Int[np.ndarray, " k"]:
+    """What stands out of tables and walls inside a mask, without what is behind the thing of which most is inside."""
+    faces = _faces(sight, segments, plane, inside)
+    own = np.flatnonzero(inside & ((plane < 0) | faces[plane]))
     # Masks reach over an object's outline: of what is behind it, the part with fewer points is left out.
     labels = segments.labels[own]
     if (labels >= 0).any():
@@ -346,10 +389,13 @@ def _side_of_box(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], b
     return ()
 
 
-def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...]) -> Chosen:
+def _chosen(
+    sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...], raised: bool = False
+) -> Chosen:
+    """What is chosen with these points, and what is uncertain; those that are raised stand on no plane on which they lie."""
     labels, taken = segments.labels, np.zeros(len(sight.points), bool)
     taken[own] = True
-    below = _below(sight, segments, own)
+    below = _below(sight, segments, own, raised)
     avoided = (labels != NOTHING) & ~taken
     # Specks beside a thing are parts of it that the camera saw badly, or what it scatters at its outline.
     specks = np.flatnonzero(labels == SPECK)
@@ -363,16 +409,19 @@ def _chosen(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes:
     return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
 
 
-def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"]) -> int | None:
+def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], raised: bool) -> int | None:
     """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one.
 
-    A plane that is a face of the thing is none.
+    A plane that is a face of the thing is none; of what is raised, each plane on which some of it lies.
     """
     if not segments.planes:
         return None
     points, mine = sight.points[own], np.zeros(len(sight.points), bool)
     mine[own] = True
-    faces = _covered(segments, _plane_of(sight, segments), mine)
+    plane_of = _plane_of(sight, segments)
+    faces = _covered(segments, plane_of, mine)
+    if raised:
+        faces |= np.bincount(plane_of[mine & (plane_of >= 0)], minlength=len(faces)) > 0
     normals = np.array([plane[:3] for plane in segments.planes])
     up = normals[0]
     if sight.from_camera and (level := np.abs(sight.T[2, :3] @ normals.T) > 0.9).any():
