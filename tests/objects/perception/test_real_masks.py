@@ -133,3 +133,17 @@ def test_too_few_points_are_refused_after_what_is_far_from_them_was_left_out() -
     mask[max(0, low[0] - 40):high[0] + 40, max(0, low[1] - 40):high[1] + 40] = True
     with pytest.raises(ObjectError, match="the mask has 2 points that stand out"):
         made.load().chosen(mask=mask & (made.owner == -1))
+
+
+@pytest.mark.parametrize(("name", "pixel", "told"), [
+    ("bin_from_above", (107, 163), r"shows a table, board or wall\. If the object is there, give .*mask=PNG"),
+    ("bin_from_above", (233, 110), r"too large or far away\. If the object is there, give .*mask=PNG.* look from nearer"),
+    ("tote", (175, 130), r"something too small\. If the object is there, look from nearer, or give .*mask=PNG"),
+    ("tote", (120, 215), r"scattered points\. If the object is there, give .*mask=PNG.* or look from nearer"),
+    ("tote", (110, 80), r"no pixel within 12 of 110 80 has a depth; .*mask=PNG"),
+])
+def test_a_pixel_that_means_no_thing_says_what_to_give_instead(
+    scenes: dict[str, Scene], name: str, pixel: tuple[int, int], told: str
+) -> None:
+    with pytest.raises(ObjectError, match=told):
+        scenes[name].chosen(pixel=pixel)

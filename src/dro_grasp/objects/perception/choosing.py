@@ -15,7 +15,7 @@ from torch import Tensor
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.raised import joined_rest, raised
-from dro_grasp.objects.perception.segmentation import BACK, NOTHING, SPECK, STRUCTURE, Segments
+from dro_grasp.objects.perception.segmentation import BACK, NOTHING, OTHER, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.reading import numbers
 
 Spot = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # x, y, z [m]
@@ -33,6 +33,14 @@ SLIVER = 0.1  # Share of a mask's points below which a thing that is mostly besi
 COVERED = 0.5  # Share of a plane's points in a mask from which the plane is a face of the object [1] (ours)
 SECOND = 0.5  # Share of another thing's points in a mask from which it is told that the thing is left out [1] (ours)
 JOINED = 0.015  # Distance of a thing's top from the edge of a level face up to which it ends there [m] (ours)
+INSTEAD = {
+    STRUCTURE: ("a table, board or wall", "give the object's pixels (mask=PNG)"),
+    NOTHING: ("scattered points", "give the object's pixels (mask=PNG), or look from nearer"),
+    SPECK: ("something too small", "look from nearer, or give the object's pixels (mask=PNG)"),
+    OTHER: ("something too large or far away", "give the object's pixels (mask=PNG): it may hang together with what is around "
+            "it; or look from nearer"),
+}
+"""What a pixel shows that shows no thing, and what to do if the object is there."""
 ALONG = 0.5  # Share of its top at such an edge from which it may be a side of a box [1] (ours)
 
 
@@ -214,13 +222,13 @@ def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> tupl
     away = np.linalg.norm(image - wanted, axis=1)
     closest = int(away.argmin())
     if away[closest] > ASIDE:
-        raise ObjectError(f"no pixel within {ASIDE} of {wanted[0]:g} {wanted[1]:g} has a depth; '{name}' shows "
-                          f"{listed(sight, segments)}")
+        raise ObjectError(f"no pixel within {ASIDE} of {wanted[0]:g} {wanted[1]:g} has a depth; give one that has, or the "
+                          f"object's pixels (mask=PNG). '{name}' shows {listed(sight, segments)}")
     number = int(segments.labels[closest])
     if number < 0:
-        what = {STRUCTURE: "a table, board or wall", NOTHING: "scattered points", SPECK: "something too small"}.get(
-            number, "something too large or far away")
-        raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}; '{name}' shows {listed(sight, segments)}")
+        what, instead = INSTEAD.get(number, INSTEAD[OTHER])
+        raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}. If the object is there, {instead}. '{name}' shows "
+                          f"{listed(sight, segments)}")
     return number, int(segments.parts[closest])
 
 
@@ -288,8 +296,8 @@ def _masked(
 def _raised_note(segments: Segments, own: Int[np.ndarray, " k"]) -> str:
     on = int((segments.labels[own] == STRUCTURE).sum())
     return ("no thing that stands out by itself is in the mask for the most part, so what the mask shows that is higher than "
-            f"its surroundings counts: {len(own)} points, {on} of them on what looks like a table, a board or a wall. If that is "
-            "not the object, give a mask that is true on all of the object, and on nothing else")
+            f"its surroundings counts: {len(own)} points, {on} of them on what looks like a table, a board or a wall. If that "
+            "is not the object, give a mask that is true on all of the object, and on nothing else")
 
 
 def _higher_note(faces: Int[np.ndarray, " m"], own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
