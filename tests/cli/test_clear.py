@@ -68,7 +68,7 @@ def test_each_table_is_drawn_of_the_objects(played: list[Any]) -> None:
 
 
 @pytest.mark.parametrize(("given", "told"), [
-    (("--things", 4), "1 tables of 4 things are asked for, of 3 objects"), (("--tables", 0), "0 tables of 3 things"),
+    (("--things", 4), "1 table of 4 things is asked for, of 3 objects"), (("--tables", 0), "0 tables of 3 things"),
     (("--tries", 0), "tries is 0; give at least 1"), (("--bin", 0, 0, 0, 0, 0), "the bin has size"),
     (("--output", "tables.csv"), "give a name that ends in .jsonl"), (("--video", "clear.mp4"), ".gif or .webp"),
 ])

@@ -81,8 +81,29 @@ def test_what_contradicts_a_scene_is_refused(common: list[str], more: list[str],
 
 def test_options_of_a_scene_need_one(weights: str, capsys) -> None:
     assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--nearest"]) == 2
-    assert "--nearest concern a scene" in " ".join(capsys.readouterr().err.split())
+    assert "--nearest concerns a scene" in " ".join(capsys.readouterr().err.split())
+    assert main(["generate", "--hand", "gripper3", "--object", "mug", "--weights", weights, "--nearest", "--part"]) == 2
+    assert "--nearest and --part concern a scene" in " ".join(capsys.readouterr().err.split())
 
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "npy"])
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_depth_image_given_as_an_object_is_told_to_be_a_scene(
+    weights: str, seen: bool, suffix: str, tmp_path: Path, capsys
+) -> None:
+    path, camera = tmp_path / f"depth.{suffix}", tmp_path / "camera.json"
+    depth = np.full((60, 80), 700, np.uint16)
+    np.save(path, depth) if suffix == "npy" else Image.fromarray(depth).save(path)
+    camera.write_text(json.dumps({"frame": "base", "T_frame_camera": np.diag([1.0, -1, -1, 1]).tolist()}))
+    more = ["--camera", str(camera)] if seen else []
+    assert main(["generate", "--hand", "gripper3", "--object", str(path), "--weights", weights, *more]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "If it is a depth image, give it as a scene" in told
+    assert "--scene FILE --camera JSON" in told
+    assert "--pixel U V" in told
+    assert "states the intrinsics" in told
+    with pytest.raises(ObjectError, match=r"If it is a depth image, .*load_scene and object_at in Python"):
+        load_object(path)
 
 @pytest.mark.parametrize(("more", "told"), [
     (["--protocol", "carry"], "--protocol carry asks for a trial in simulation, and a thing of a scene is a bare point cloud"),

@@ -123,7 +123,7 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     (["--output", "nowhere/plan.npz"], "create it first"),
     (["--at", "nan", "0.1"], "--at is nan 0.1; give x and y in metres"),
     (["--at", "0.5", "inf"], "--at is 0.5 inf; give x and y in metres"),
-    (["--nearest"], "--nearest concern a scene"),
+    (["--nearest"], "--nearest concerns a scene"),
     (["--scene", "depth.png"], "both are given"),
     (["--at", "0.5", "0.1", "0"], "--at is 0.5 0.1 0; give x and y in metres"),
     (["--planner-seconds", "nan"], "planner_seconds is nan; give a number above 0"),

@@ -76,8 +76,9 @@ class Clear:
         names = resolve_objects(list(self.objects))
         count = len(names) if self.things is None else self.things
         if self.tables < 1 or not 1 <= count <= len(names):
-            raise OptionError(f"{self.tables} tables of {count} things are asked for, of {len(names)} objects; give at least "
-                              "one table, and no more things than objects")
+            tables, things = _counted(self.tables, "table"), _counted(count, "thing")
+            raise OptionError(f"{tables} of {things} {'is' if self.tables == 1 else 'are'} asked for, of "
+                              f"{_counted(len(names), 'object')}; give at least one table, and no more things than objects")
         config, robot = self._config(), load_robot(self.robot)
         key = {"robot": robot.sha256, "objects": [load_object(name).sha256 for name in names], "things": count,
                "seed": self.seed, "weights": describe_weights(self.weights)["sha256"], "settings": asdict(config)}
@@ -170,6 +171,10 @@ def _read(path: Path | None, key: dict[str, Any]) -> dict[int, dict[str, Any]]:
     with reading(path, GraspFileError, "a file of cleared tables (.jsonl); name another one, or move this one away", *UNTYPED):
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
         return {line["table"]: line for line in lines if line["key"] == key}
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _append(path: Path | None, line: dict[str, Any]) -> None:

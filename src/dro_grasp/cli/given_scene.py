@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,30 +34,34 @@ def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
         concern = [option for option in given if option not in own]
         concern += ["--part"] * command.part + ["--scene-picture"] * (command.scene_picture is not None)
         if concern:
-            raise OptionError(f"{' and '.join(concern)} concern a scene; give it by --scene instead of --object")
+            verb = "concerns" if len(concern) == 1 else "concern"
+            raise OptionError(f"{' and '.join(concern)} {verb} a scene; give it by --scene instead of --object")
     elif len(given) > 1:
         raise OptionError(f"{' and '.join(given)} each say which thing of the scene is meant; give one of them")
     if command.scene_picture is not None:
         check_output(command.scene_picture, ".png")
 
 
-def find_thing(scene: Scene, command: Generate | Plan) -> FoundObject:
-    """The one thing of the scene that is meant; the picture is drawn even where none is."""
+def find_thing(
+    scene: Scene, command: Generate | Plan, find: Callable[..., FoundObject] | None = None
+) -> FoundObject:
+    """The one thing of the scene that is meant, by `object_at` or by `find`; the picture is drawn even where none is."""
     with _picture_if_refused(scene, command.scene_picture):
-        found = scene.object_at(command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest, part=command.part)
+        found = (find or scene.object_at)(
+            command.at, pixel=command.pixel, mask=command.mask, nearest=command.nearest, part=command.part)
     _picture(scene, found, command.scene_picture)
     return found
 
 
 def find_on_table(scene: Scene, robot: Robot, command: Plan) -> PickedObject:
     """The thing on a robot's table that is meant, flat or not; the picture is drawn in either case."""
-    from dro_grasp.arm.tabletop.table_scene import as_picked, picked_flat
+    from dro_grasp.arm.tabletop.table_scene import as_picked, found_on_table, picked_flat
     from dro_grasp.objects.perception.choosing import all_within
 
     with _picture_if_refused(scene, command.scene_picture):
         flat = None if command.mask is None else picked_flat(scene, robot, command.mask)
     if flat is None:
-        return as_picked(find_thing(scene, command), robot, scene)
+        return as_picked(find_thing(scene, command, partial(found_on_table, scene, robot)), robot, scene)
     if command.scene_picture is not None:
         assert scene.sight is not None
         _picture(scene, all_within(scene.name, scene.sight, scene.segments, command.mask), command.scene_picture)

@@ -18,7 +18,7 @@ from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
 from dro_grasp.objects.perception.things import AS_SCENE, one_thing, refuse_scene
-from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, returned
+from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, in_rows, read_geometry, refuse_image, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 LARGEST = 1.0  # Largest extent of an object that counts as metres [m] (ours)
@@ -107,6 +107,7 @@ def cloud_object(
     `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
     `named_normals` judges the normals that a file calls so: they are turned or estimated where they are no outward ones.
     """
+    refuse_image(points, origin)
     points = in_rows(points)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "

@@ -14,6 +14,7 @@ from torch import Tensor
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import reading
 from dro_grasp.geometry.mesh_files import check_bytes, open_mesh, trimesh
+from dro_grasp.objects.perception.things import AS_SCENE
 
 ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene | tuple[Any, Any] | Num[np.ndarray, "..."]
                 | Num[Tensor, "..."])
@@ -22,6 +23,8 @@ ORIGIN = "the given object"  # What messages call it
 MOST_GROWTH = 128  # What LZF can shorten data to [1]. Source: its longest copy, 264 bytes, takes 3
 ALONE = 0.1  # Distance of a point from all others, over the extent of these, that puts it elsewhere [1] (ours)
 FEW = 16  # Points of which none is called alone (ours)
+IMAGES = {".png", ".tif", ".tiff"}  # Files of depth images, beside NPY
+NARROWEST = 32  # Width from which an array (h, w) is an image, and no list of points (ours)
 CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 
 
@@ -38,6 +41,7 @@ def read_rows(path: Path) -> Float[np.ndarray, "n columns"]:
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
         raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out camera=..., or give a cloud (PLY, NPY, PCD)")
+    refuse_image(geometry, str(path))
     rows = in_rows(geometry)
     points = coordinates(rows, str(path)) * unit
     return np.column_stack([points, rows[:, 3:]]) if rows.shape[1] == 6 else points
@@ -56,6 +60,18 @@ def in_rows(cloud: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
     return cloud.reshape(-1, cloud.shape[2]) if cloud.ndim == 3 and cloud.shape[2] in (3, 6) else cloud
 
 
+def is_image(array: Shaped[np.ndarray, "..."]) -> bool:
+    """Whether an array is an image, and no list of points."""
+    return array.ndim == 2 and array.shape[1] >= NARROWEST
+
+
+def refuse_image(array: Shaped[np.ndarray, "..."], origin: str) -> None:
+    """Refuse an image where points are needed, by an ObjectError."""
+    if is_image(array):
+        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points. If it is a depth image, "
+                          f"{AS_SCENE}; the camera's file states the intrinsics")
+
+
 def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Which points of a cloud are where something was seen: NaN, infinity and (0, 0, 0) stand for pixels without a depth.
 
@@ -71,6 +87,9 @@ def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
+    if path.suffix.lower() in IMAGES:
+        raise ObjectError(f"{path} is an image, and no mesh or cloud. If it is a depth image, {AS_SCENE}; the camera's file "
+                          "states the intrinsics")
     if path.suffix.lower() in CLOUD_SUFFIXES:
         return read_cloud(path), 1.0
     # trimesh alone is called here, and its many readers raise whatever they stumble over.

@@ -71,6 +71,8 @@ class Scene:
     """All points as they were seen; None for a mesh."""
     beside: tuple[Scene, ...] = ()
     """Further scenes in the same frame, which are avoided as well."""
+    whole: Scene | None = None
+    """All that was seen, where this is a part of it; None where it is all."""
 
     def __repr__(self) -> str:
         made = f"cloud of {len(self.points)} points" if self.faces is None else f"mesh of {len(self.faces)} faces"
@@ -80,7 +82,8 @@ class Scene:
         """The same in another frame; T takes its coordinates there [m]."""
         sight = None if self.sight is None else self.sight.moved(T)
         beside = tuple(scene.moved(T) for scene in self.beside)
-        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces, sight, beside)
+        whole = None if self.whole is None else self.whole.moved(T)
+        return Scene(self.name, trimesh.transform_points(self.points, T), self.faces, sight, beside, whole)
 
     def joined(self, other: Scene | None) -> Scene:
         """Both, to be avoided; both are in one frame."""
@@ -92,9 +95,9 @@ class Scene:
         return (replace(self, beside=()), *(part for scene in self.beside for part in scene.parts))
 
     def of(self, kept: Bool[np.ndarray, " n"]) -> Scene:
-        """The same with some of its points alone, of those that were seen."""
+        """The same with some of its points alone, of those that were seen; it knows the whole."""
         assert self.sight is not None
-        return _seen(self.name, self.sight.of(kept), self.name)
+        return replace(_seen(self.name, self.sight.of(kept), self.name), whole=self.whole or self)
 
     @cached_property
     def segments(self) -> Segments:

@@ -12,8 +12,9 @@ import dro_grasp as dro
 from dro_grasp.arm.planning.physics import LiftScene
 from dro_grasp.arm.planning.workcell import VOXEL, Workcell, moved, occupied
 from dro_grasp.arm.tabletop.camera_view import depth_image
-from dro_grasp.arm.tabletop.table_scene import pick_object, seen_on_table
+from dro_grasp.arm.tabletop.table_scene import OVERHANG, pick_object, seen_on_table
 from dro_grasp.cli.main import main
+from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import load_scene
 
 CUBE, BALL, RADIUS = (0.45, 0.1), (0.5, -0.1), 0.04
@@ -87,6 +88,58 @@ def test_what_is_beside_the_table_is_left_out(table_cloud: np.ndarray, robot: dr
     assert seen_on_table(scene, robot).segments.count == 2
     with pytest.raises(dro.DroGraspError, match="shows nothing of the table"):
         seen_on_table(load_scene(far), robot)
+
+
+def _ending_at(robot: dro.Robot, x: float) -> dro.Robot:
+    """The robot with a table that ends at an x [m]."""
+    assert robot.table is not None
+    return replace(robot, table=replace(robot.table, centre=(x - 0.6, 0.0)))
+
+
+def test_a_thing_that_the_stated_table_cuts_is_told(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    scene = load_scene(table_cloud)
+    short = _ending_at(robot, CUBE[0] - OVERHANG)  # the cut is in the middle of the cube
+    for seen in (scene, seen_on_table(scene, short)):  # cut here, or before
+        picked = pick_object(seen, short, (CUBE[0] - 0.02, CUBE[1], 0.05))
+        (note,) = [note for note in picked.obj.notes if "over the edge" in note]
+        assert "reaches 13 cm over the edge of the table of robot" in note
+        assert "more than 10 cm beyond the edge" in note
+        assert "3 x 6 x 6 cm of the 6 x 6 x 6 cm that are seen are taken. Correct the table's" in note
+    turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    cut = seen_on_table(scene, short).moved(turn)
+    assert cut.whole is not None
+    np.testing.assert_allclose(cut.whole.points_seen(), scene.moved(turn).points_seen())
+    for x in (CUBE[0] - OVERHANG + 0.035, 1.05):  # overhangs, and is whole
+        picked = pick_object(scene, _ending_at(robot, x), (CUBE[0] - 0.02, CUBE[1], 0.05))
+        assert not any("over the edge" in note for note in picked.obj.notes)
+
+
+def test_a_flat_thing_that_the_stated_table_cuts_is_told(robot: dro.Robot) -> None:
+    down = np.array([[1.0, 0, 0, 0.45], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+    camera = SceneCamera(down, np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), "world")
+    depth, mask = np.full((240, 320), 1.0), np.zeros((240, 320), bool)
+    mask[100:140, 145:175] = True  # 10 cm along x
+    depth[mask] = 0.99
+    scene = load_scene(depth, camera=camera)
+    picked = pick_object(scene, _ending_at(robot, 0.45 - OVERHANG), mask=mask)
+    assert any("reaches 15 cm over the edge of the table" in note and "5 x 13 x 0 cm of the 10 x 13 x 0 cm" in note
+               for note in picked.obj.notes)
+    assert not any("over the edge" in note for note in pick_object(scene, robot, mask=mask).obj.notes)
+
+
+def test_a_thing_beside_the_stated_table_is_told(
+    table_cloud: np.ndarray, robot: dro.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = _ending_at(robot, 0.2)
+    with pytest.raises(dro.DroGraspError, match=r"shows a thing there, of 6 x 6 x 6 cm at .*, but it is beside the table of "
+                       r"robot .* 1\.2 x 1\.4 m about .*Correct the table's `centre`.* On the table: "):
+        pick_object(load_scene(table_cloud), short, (*CUBE, 0.03))
+    with pytest.raises(dro.DroGraspError, match=r"^'scene' shows no thing within 5 cm|^nothing stands out"):
+        pick_object(load_scene(table_cloud), short, (0.15, -0.4, 0.03))
+    np.save(tmp_path / "cloud.npy", table_cloud + np.array([1.0, 0, 0]))
+    assert main(["plan", "--robot", "xarm7_leaphand", "--scene", str(tmp_path / "cloud.npy"), "--output",
+                 str(tmp_path / "plan.npz"), "--at", str(CUBE[0] + 1.0), str(CUBE[1]), "0.03"]) == 2
+    assert "but it is beside the table of robot 'xarm7_leaphand'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_slope_is_no_table(table_cloud: np.ndarray, robot: dro.Robot) -> None:

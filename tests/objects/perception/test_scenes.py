@@ -245,6 +245,16 @@ def test_a_loose_mask_takes_no_table(share: float) -> None:
         scene.chosen(mask=mask & table.reshape(mask.shape))
 
 
+def test_a_mask_of_another_size_names_its_file_and_both_sizes(tmp_path: Path) -> None:
+    scene = make_scene("table", 1, 0, width=160).load()
+    Image.fromarray(np.full((60, 80), 255, np.uint8)).save(tmp_path / "m.png")
+    with pytest.raises(ObjectError, match=r"the mask .*m\.png has shape \(60, 80\), and what the camera saw, '.*', has "
+                       r"\(120, 160\): rows and columns"):
+        scene.chosen(mask=tmp_path / "m.png")
+    with pytest.raises(ObjectError, match=r"^the mask has shape \(60, 80\), and what the camera saw"):
+        scene.chosen(mask=np.ones((60, 80), bool))
+
+
 def test_what_a_mask_shows_beside_its_thing_is_told() -> None:
     made = make_scene("table", 3, 9, 1, width=480)
     scene = made.load()

@@ -6,23 +6,29 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from dro_grasp.arm.flat.things import overhang, seen_flat
 from dro_grasp.arm.planning.placing import LEVEL, height_below
 from dro_grasp.arm.planning.workcell import VOXEL
 from dro_grasp.arm.robots.robot import Robot, Table
-from dro_grasp.errors import ObjectError, RobotError
+from dro_grasp.errors import DroGraspError, ObjectError, RobotError
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.perception.choosing import Pixel, Spot, within
+from dro_grasp.objects.perception.choosing import Pixel, Spot, place_of, within
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
 OVERHANG = 0.1  # How far things may overhang the table [m] (ours)
 APART = 0.015  # Difference between a table's seen and stated height that is told [m] (ours)
 SUNK = 0.03  # Depth below its stated height from which what is seen is no table, unless that is seen as well [m] (ours)
+NEAR_CUT = 0.015  # Way from a thing to what was cut off at which it may go on there [m] (ours)
+LOST = 0.02  # Share of a thing's points that are cut off from which it is told [1] (ours)
+CORRECT = ("Correct the table's `centre` and `size` in the robot file, or the pose of the camera, or move the thing onto the "
+           "table")
+"""What to do about a thing that is not on the table."""
 BELOW = 0.05  # Depth below the table from which on what is beside it is something else [m] (ours)
 
 
@@ -75,7 +81,35 @@ def pick_object(
     seen = seen_on_table(scene, robot)
     if mask is not None and (flat := picked_flat(seen, robot, mask, name)) is not None:
         return flat
-    return as_picked(seen.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name), robot, seen)
+    found = found_on_table(seen, robot, at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name)
+    return as_picked(found, robot, seen)
+
+
+def found_on_table(
+    scene: Scene, robot: Robot, at: Spot | None = None, *, pixel: Pixel | None = None, mask: Any = None,
+    nearest: bool = False, part: bool = False, name: str | None = None,
+) -> FoundObject:
+    """The object that is meant of what `seen_on_table` left; arguments as for `pick_object`.
+
+    Raises:
+        ObjectError: There is none, or it is beside the table, which the message then says.
+    """
+    try:
+        return scene.object_at(at, pixel=pixel, mask=mask, nearest=nearest, part=part, name=name)
+    except ObjectError as error:
+        if (whole := scene.whole) is None or (at is None and pixel is None and mask is None and not nearest):
+            raise
+        try:
+            chosen = whole.chosen(at, pixel, mask, nearest, part)
+        except DroGraspError:
+            raise error from None
+        points, table = whole.points_seen()[chosen.own], _table(robot, scene.name)
+        beyond = 100 * overhang(points, table)
+        if beyond.max() <= 0:
+            raise
+        lies = "is beside" if beyond.min() > 0 else f"reaches {beyond.max():.0f} cm over the edge of"
+        raise ObjectError(f"'{scene.name}' shows a thing there, of {_size(points)} at {place_of(points)}, but it {lies} the "
+                          f"{_stated(robot)}. {CORRECT}. On the table: {error}") from error
 
 
 def as_picked(found: FoundObject, robot: Robot, scene: Scene) -> PickedObject:
@@ -83,7 +117,43 @@ def as_picked(found: FoundObject, robot: Robot, scene: Scene) -> PickedObject:
     others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
     level = at_seen_height(robot, found.obj, scene)
     assert level.table is not None
-    return PickedObject(found.obj, _solid(others, level.table.height), level).noted(robot)
+    obj = replace(found.obj, notes=(*found.obj.notes, *_cut_note(robot, scene, found.chosen.pixels)))
+    return PickedObject(obj, _solid(others, level.table.height), level).noted(robot)
+
+
+def _cut_note(robot: Robot, scene: Scene, pixels: Int[np.ndarray, " k"], mask: Any = None) -> tuple[str, ...]:
+    """A note where an object with these pixels, or rows, goes on beside the table, where `seen_on_table` cut it off."""
+    whole = scene.whole
+    if whole is None or whole.sight is None or scene.sight is None:
+        return ()
+    world, seen = whole.points_seen(), whole.sight.pixels
+    cut, own = ~np.isin(seen, scene.sight.pixels), np.isin(seen, pixels)
+    if not cut.any() or KDTree(world[own]).query(world[cut], distance_upper_bound=NEAR_CUT)[0].min() > NEAR_CUT:
+        return ()
+    if mask is not None:
+        thing = within(whole.name, whole.sight, mask)
+    else:
+        labels = whole.segments.labels
+        if not (labels[own] >= 0).any():
+            return ()
+        thing = labels == np.bincount(labels[own & (labels >= 0)]).argmax()
+    if (thing & cut).sum() <= LOST * thing.sum():
+        return ()
+    beyond = 100 * float(overhang(world[thing], _table(robot, scene.name)).max())
+    return (f"it reaches {beyond:.0f} cm over the edge of the {_stated(robot)}, and what is more than {100 * OVERHANG:.0f} cm "
+            f"beyond the edge, or hangs below it, is left out: {_size(world[own])} of the {_size(world[thing])} that are seen "
+            f"are taken. {CORRECT}",)
+
+
+def _stated(robot: Robot) -> str:
+    """The table of a robot in words, as its file states it."""
+    assert robot.table is not None
+    (x, y), (width, depth) = robot.table.centre, robot.table.size
+    return f"table of robot '{robot.name}', which its file states to be {width:g} x {depth:g} m about x = {x:g}, y = {y:g} m"
+
+
+def _size(points: Float[np.ndarray, "n 3"]) -> str:
+    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0)) + " cm"
 
 
 def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) -> PickedObject | None:
@@ -95,7 +165,9 @@ def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) 
     if flat is None:
         return None
     refuse_sunk(robot, flat.table, scene)
-    return PickedObject(flat.obj, flat.others, replace(robot, table=replace(table, height=flat.table))).noted(robot)
+    note = _cut_note(robot, scene, sight.pixels[within(scene.name, sight, mask)], mask)
+    obj = replace(flat.obj, notes=(*flat.obj.notes, *note))
+    return PickedObject(obj, flat.others, replace(robot, table=replace(table, height=flat.table))).noted(robot)
 
 
 def seen_on_table(scene: Scene, robot: Robot) -> Scene:

@@ -227,8 +227,8 @@ def _at_pixel(name: str, sight: Sight, segments: Segments, pixel: Pixel) -> tupl
     number = int(segments.labels[closest])
     if number < 0:
         what, instead = INSTEAD.get(number, INSTEAD[OTHER])
-        raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}. If the object is there, {instead}. '{name}' shows "
-                          f"{listed(sight, segments)}")
+        raise ObjectError(f"the pixel {wanted[0]:g} {wanted[1]:g} shows {what}. If the object is there, {instead}. '{name}' "
+                          f"shows {listed(sight, segments)}")
     return number, int(segments.parts[closest])
 
 
@@ -254,7 +254,9 @@ def within(name: str, sight: Sight, mask: Any) -> Bool[np.ndarray, " n"]:
                           "cloud (h, w, 3), or a place (at=(X, Y, Z))")
     wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else numbers(mask, "the mask", "biuf") != 0
     if wanted.shape != sight.shape:
-        raise ObjectError(f"the mask has shape {wanted.shape}, the image {sight.shape}; give one of the same size")
+        which = f"the mask {mask}" if isinstance(mask, str | Path) else "the mask"
+        raise ObjectError(f"{which} has shape {wanted.shape}, and what the camera saw, '{name}', has {sight.shape}: rows and "
+                          "columns of its image; give a mask with one value for each pixel of that image")
     return np.asarray(wanted.ravel()[sight.pixels])
 
 

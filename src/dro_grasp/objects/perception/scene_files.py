@@ -17,11 +17,9 @@ from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
 from dro_grasp.objects.perception.choosing import Sight
 from dro_grasp.objects.perception.scan import NEAREST, check_depths, check_intrinsics
-from dro_grasp.objects.reading import numbers, read_cloud, returned
+from dro_grasp.objects.reading import IMAGES, is_image, numbers, read_cloud, returned
 
-IMAGES = {".png", ".tif", ".tiff"}  # Files of depth images, beside NPY
 WHOLE_UNIT = 0.001  # Unit of depths that are whole numbers [m]. Source: REP 118, ROS
-NARROWEST = 32  # Width from which an array (h, w) is an image, and no list of points (ours)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,7 @@ def as_camera(camera: SceneCamera | Path | str) -> SceneCamera:
 def is_depth(source: Path | Shaped[np.ndarray, "..."]) -> bool:
     """Whether a file or an array is a depth image, and no cloud."""
     if isinstance(source, np.ndarray):
-        return source.ndim == 2 and source.shape[1] >= NARROWEST
+        return is_image(source)
     if source.suffix.lower() != ".npy":
         return source.suffix.lower() in IMAGES
     return is_depth(_array(source))
