@@ -400,12 +400,12 @@ def _side_of_box(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], b
 
 
 def _chosen(
-    sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...], raised: bool = False
+    sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], notes: tuple[str, ...], higher: bool = False
 ) -> Chosen:
     """What is chosen with these points, and what is uncertain; those that are raised stand on no plane on which they lie."""
     labels, taken = segments.labels, np.zeros(len(sight.points), bool)
     taken[own] = True
-    below = _below(sight, segments, own, raised)
+    below = _below(sight, segments, own, higher)
     avoided = (labels != NOTHING) & ~taken
     # Specks beside a thing are parts of it that the camera saw badly, or what it scatters at its outline.
     specks = np.flatnonzero(labels == SPECK)
@@ -419,7 +419,7 @@ def _chosen(
     return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
 
 
-def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], raised: bool) -> int | None:
+def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], higher: bool) -> int | None:
     """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one.
 
     A plane that is a face of the thing is none; of what is raised, each plane on which some of it lies.
@@ -430,7 +430,7 @@ def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], raised:
     mine[own] = True
     plane_of = _plane_of(sight, segments)
     faces = _covered(segments, plane_of, mine)
-    if raised:
+    if higher:
         faces |= np.bincount(plane_of[mine & (plane_of >= 0)], minlength=len(faces)) > 0
     normals = np.array([plane[:3] for plane in segments.planes])
     up = normals[0]
