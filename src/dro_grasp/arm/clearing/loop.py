@@ -23,7 +23,7 @@ from dro_grasp.arm.planning.trajectory import free_motion, smooth, standing, sti
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object, seen_on_table
-from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
+from dro_grasp.errors import DroGraspError, ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
@@ -153,7 +153,7 @@ def clear_table(
     Raises:
         OptionError: The robot has no table or no camera.
         RobotError: It collides where it stands.
-        PlanError: The arm does not reach the bin, or does not find its way home.
+        PlanError: The arm does not reach the bin.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
     robot.require_table()
@@ -265,11 +265,12 @@ def _carry_out(
             if check.state == "slipping":
                 _follow(rig, made, ("lift",), back=True)
             _open(rig, robot)
-            _go_home(rig, Workcell(seen.robot, [*around, seen.obj]))
+            reached = "close" if check.state == "slipping" else stages[-1]
+            _go_home(rig, Workcell(seen.robot, [*around, seen.obj]), made, reached)
             pick = Pick(place, stages[-1], f"the hand is {check.state}, by its joints")
             return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
     _follow(rig, made, PLACING[1:])  # what slips above the bin may do so
-    _go_home(rig, Workcell(seen.robot, around))
+    _go_home(rig, Workcell(seen.robot, around), made, PLACING[-1])
     return Outcome(pick, cloud, np.array(made.notes.T_world_wrist))
 
 
@@ -303,11 +304,10 @@ def _open(rig: Rig, robot: Robot) -> None:
     rig.move(still(arm, way), way)
 
 
-def _go_home(rig: Rig, cell: Workcell) -> None:
-    """Bring the arm home with the hand open, clear of what was seen, where it can.
+def _go_home(rig: Rig, cell: Workcell, made: MotionPlan, reached: str) -> None:
+    """Bring the arm home with the hand open, clear of what was seen, where it can; else back the way that it came.
 
-    Raises:
-        PlanError: There is no path.
+    The arm is where a stage of the plan that it followed ends.
     """
     robot = cell.robot
     arm, opened = rig.joints()[0], robot.open_hand
@@ -318,5 +318,7 @@ def _go_home(rig: Rig, cell: Workcell) -> None:
         if (way := free_motion(robot, arm, robot.home, free, HOME_SECONDS, 0)) is not None:
             rig.move(way, still(opened, way))
             return
-    met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
-    raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")
+    whole = slice(0, made.part(reached).stop)
+    came = made.arm
+    back = _reversed(Trajectory(came.time[whole], came.position[whole], came.velocity[whole], came.acceleration[whole]))
+    rig.move(back, still(opened, back))
