@@ -154,6 +154,10 @@ def test_what_is_no_obstacle_is_referred_to_surroundings(tmp_path: Path) -> None
     with pytest.raises(dro.DroGraspError, match="too large for an obstacle") as caught:
         load_obstacle(str(tmp_path / "room.npy"))
     assert "scene" not in str(caught.value)
+    np.save(tmp_path / "depth.npy", np.ones((48, 64), np.float32))
+    with pytest.raises(dro.DroGraspError, match=r"an array of shape \(48, 64\).*with --surroundings") as caught:
+        load_obstacle(str(tmp_path / "depth.npy"))
+    assert "scene" not in str(caught.value)
     half = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 1, 2], [0, 3, 1]])
     half.export(tmp_path / "half.stl")
     flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [2, 1, 3]])

@@ -71,7 +71,7 @@ def test_what_nobody_expects_cannot_be_checked() -> None:
     assert HoldExpectation.of(grasps, 0) is None
     with pytest.raises(OptionError, match="nothing is expected of these grasps; let `expect_hold` find it first"):
         check_hold(HoldExpectation.of(grasps, 0), [0.0])
-    with pytest.raises(OptionError, match="index is 7, and there are 1 grasps; give one from 0 to 0"):
+    with pytest.raises(OptionError, match="index is 7; give one from -1 to 0: the batch has 1"):
         HoldExpectation.of(grasps, 7)
 
 

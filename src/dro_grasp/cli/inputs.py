@@ -22,8 +22,8 @@ Ball = tuple[float, float, float, float]  # Centre and radius [m]
 Mass = Annotated[float | None, tyro.conf.arg(metavar="KG", help_behavior_hint="(default: density times volume)")]
 Friction = Annotated[float, tyro.conf.arg(
     metavar="MU", help="Friction between hand, objects and table, in simulation and in the planner's rehearsals.")]
-AVOIDED = ("for a hand to grasp", "is an open sheet", "encloses no volume")
-"""What is said of things of other sizes and of sheets, which are no things to grasp, and may still be in the way."""
+AVOIDED = ("for a hand to grasp", "If it is a depth image", "is an open sheet", "encloses no volume")
+"""What is said of things of other sizes, images and sheets, which are no things to grasp, and may still be in the way."""
 Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 
@@ -46,8 +46,8 @@ def load_obstacle(name: str) -> ObjectModel:
     except ObjectError as error:
         if not any(refused in str(error) for refused in AVOIDED):
             raise
-        size, grasped, _ = str(error).partition("for a hand to grasp")  # After it follow words on scenes and scales
-        told = f"{size}for an obstacle" if grasped else size
+        size, grasped, _ = str(error).partition(AVOIDED[0])  # After it follow words on scenes and scales
+        told = f"{size}for an obstacle" if grasped else size.partition(f". {AVOIDED[1]}")[0]
         advice = ("--obstacles takes clouds and meshes of things, in metres, 5 mm to 1 m large, meshes with an inside; "
                   "all else to stay clear of is given with --surroundings, a mesh or cloud of any size")
         raise ObjectError(f"{told}. {advice}") from error

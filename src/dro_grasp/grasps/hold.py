@@ -3,7 +3,8 @@
 Fingers that close on an object stop where it is, and press; fingers that close on nothing go on to their targets. Both ends are
 known from closings in simulation (`expect_hold`). Fingers from which an object slips move while it does, and only then: whoever
 watches them for a fifth of a second sees it, unless the object slides along fingers that rest. Joints that are far from all of
-this say nothing of the object: the hand has not closed, an encoder fails, or numbers are in other units. Ours.
+this say nothing of the object: the hand has not closed, encoders fail, or numbers are in other units. One wrong joint of many
+is not told: objects push single fingers aside as far. Ours.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ class HoldExpectation:
             OptionError: There is no grasp of this index.
         """
         if not -len(grasps) <= index < len(grasps):
-            raise OptionError(f"index is {index}, and there are {len(grasps)} grasps; give one from 0 to {len(grasps) - 1}")
+            raise OptionError(
+                f"index is {index}; give one from {-len(grasps)} to {len(grasps) - 1}: the batch has {len(grasps)} grasps")
         if not all(name in grasps.extra for name in HOLD_COLUMNS):
             return None
         rows = [grasps.extra[name][index].double().numpy() for name in HOLD_COLUMNS]
@@ -140,7 +142,7 @@ def check_hold(
 
     Measure after the lift, best for a fifth of a second (`watched`). Where joints end at the same place with the object and
     without, the confidence is low, and efforts or a load are needed. Slow motion of the object is neither held nor slipping. An
-    unexpected hand is open, broken, or measured in other units: look at it.
+    unexpected hand is open, broken, or measured in other units: look at it. Of many joints, one that is wrong is not told.
 
     Args:
         expected: What to expect, of a plan (`MotionPlan.hold`) or of grasps (`HoldExpectation.of`).

@@ -68,6 +68,8 @@ def is_image(array: Shaped[np.ndarray, "..."]) -> bool:
 def refuse_image(array: Shaped[np.ndarray, "..."], origin: str) -> None:
     """Refuse an image where points are needed, by an ObjectError."""
     if is_image(array):
+        if len(array) == 3:
+            raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points: transpose it")
         raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points. If it is a depth image, "
                           f"{AS_SCENE}; the camera's file states the intrinsics")
 

@@ -48,6 +48,7 @@ def test_stages_lead_to_the_grasp_and_up(planned: MotionPlan, robot: dro.Robot) 
     for state, what, values in (("held", "joints", planned.hold.held_joints), ("empty", "effort", planned.hold.empty_efforts)):
         assert close["expected"][state][what] == pytest.approx(
             dict(zip(robot.hand_joints, values.tolist(), strict=True)), abs=1e-6)
+    assert close["expected"]["weight"] == pytest.approx(planned.hold.weight, abs=1e-6)
     silent = replace(planned, notes=replace(planned.notes, hold=None))
     assert not any("expected" in stage for stage in task_stages(silent, robot))
     assert by_name["attach"]["attach_objects"] == {"objects": [planned.notes.object], "link": robot.hand.wrist_link}

@@ -59,7 +59,7 @@ def test_the_report_names_what_is_counted_otherwise(values: dict[str, Any], tmp_
 @pytest.mark.parametrize(("stated", "told"), [
     ({"zeros": {"joint9": 1}}, "zeros names joint 'joint9'; the joints of arm and hand are joint1, joint2"),
     ({"zeros": {"joint1": "x"}}, "zeros of joint joint1 is 'x'; expected a number"),
-    ({"zeros": {"joint1": -500}}, r"zeros of joint joint1 is -500 rad, as of degrees; expected at most 6\.283 rad"),
+    ({"zeros": {"joint1": -500}}, r"zeros of joint joint1 is -500, as if it were in degrees; expected -6\.283 to 6\.283 rad"),
     ({"signs": {"joint1": 2}}, "signs of joint joint1 is 2; expected 1, or -1 where its driver counts the other way"),
     ({"signs": [1, -1]}, r"signs is \[1, -1\]; expected entries 'name: value'"),
     ({"units": {"joint1": "mm"}}, "units of joint joint1 is 'mm'; expected rad, deg, turn, or how many of them a radian has"),
@@ -77,7 +77,7 @@ def test_sliding_joints_have_lengths(values: dict[str, Any], tmp_path: Path) -> 
     values |= {"hand": str(tmp_path / "jaws.urdf")}
     told = load_robot(written(values | {"units": {"left_slide": "mm"}}, tmp_path)).drivers
     assert told.positions(np.full(len(told.zeros), 0.02))[-2:] == pytest.approx([20.0, 0.02])
-    with pytest.raises(RobotError, match="zeros of joint left_slide is 20 m, as of millimetres; expected at most 10 m"):
+    with pytest.raises(RobotError, match="zeros of joint left_slide is 20, as if it were in millimetres; expected -10 to 10 m"):
         load_robot(written(values | {"zeros": {"left_slide": 20}}, tmp_path))
     with pytest.raises(RobotError, match="units of joint left_slide is 'deg'; expected m, cm, mm, or how many of them a metre"):
         load_robot(written(values | {"units": {"left_slide": "deg"}}, tmp_path))

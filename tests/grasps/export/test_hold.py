@@ -53,7 +53,7 @@ def test_expected_joints_and_efforts_are_in_every_file_that_has_a_place_for_them
     text = moveit_grasps(told, hand, Frame())
     lines = [line for line in text.splitlines() if line.startswith("# grasp_")]
     assert lines == [f"# grasp_0 {name}: {', '.join([str(round(0.1 * (k + 1), 7))] * len(names))}"
-                     for k, name in enumerate(HOLD_COLUMNS[:4])]
+                     for k, name in enumerate(HOLD_COLUMNS[:4])] + ["# grasp_0 held_weight: 1.5"]
     usual = yaml.safe_load(moveit_grasps(posed(hand, 2), hand, Frame()))
     assert [set(message) for message in yaml.safe_load(text)] == [set(message) for message in usual]
 

@@ -15,7 +15,7 @@ SIGN = 0.014  # Radius of the ball that says whether the hand holds something [m
 ABOVE_HAND = 0.16  # Its height above the wrist [m]
 HOLD_COLOURS: dict[HoldState, Colour] = {
     "held": (0.20, 0.66, 0.36), "empty": (0.82, 0.28, 0.24), "slipping": (0.95, 0.6, 0.2), "unexpected": (0.5, 0.5, 0.5)}
-"""Green, red and orange."""
+"""Green, red, orange and grey."""
 
 
 class RobotView:

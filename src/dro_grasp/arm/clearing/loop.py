@@ -16,14 +16,14 @@ from jaxtyping import Bool, Float
 from dro_grasp.arm.clearing.parts import parted
 from dro_grasp.arm.clearing.picks import Memory, Outcome, Pick
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
-from dro_grasp.arm.planning.placing import Place, check_reach
+from dro_grasp.arm.planning.placing import Place, beyond_reach
 from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.arm.planning.trajectory import free_motion, smooth, standing, still
+from dro_grasp.arm.planning.trajectory import SPACING, densified, free_motion, smooth, standing, still, timed_way
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object, seen_on_table
-from dro_grasp.errors import DroGraspError, ObjectError, OptionError
+from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
@@ -151,15 +151,17 @@ def clear_table(
         judged: Called with each judgement of whether the hand holds something, when it is made.
 
     Raises:
-        OptionError: The robot has no table or no camera.
+        OptionError: The robot has no table or no camera, or does not reach the bin.
         RobotError: It collides where it stands.
-        PlanError: The arm does not reach the bin.
+        PlanError: The arm does not find its way home.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
     robot.require_table()
     assert robot.table is not None
     above = (*config.bin.centre, robot.table.height + config.bin.height + config.drop)
-    check_reach(robot, np.array(above), "where things are let go, above the bin's middle,")
+    if far := beyond_reach(robot, np.array(above)):
+        raise OptionError(f"where things are let go, above the bin's middle, {far}; put the bin nearer (bin=..., in the world "
+                          "[m])")
     memory, picks, moved = Memory(config.tries), list[Pick](), None
     tell = progress or (lambda pick: None)
     while True:
@@ -305,20 +307,40 @@ def _open(rig: Rig, robot: Robot) -> None:
 
 
 def _go_home(rig: Rig, cell: Workcell, made: MotionPlan, reached: str) -> None:
-    """Bring the arm home with the hand open, clear of what was seen, where it can; else back the way that it came.
+    """Bring the arm home with the hand open, clear of what was seen, where it can; else nearly the way that it came.
 
     The arm is where a stage of the plan that it followed ends.
+
+    Raises:
+        PlanError: Neither way is free.
     """
     robot = cell.robot
     arm, opened = rig.joints()[0], robot.open_hand
-    for around in (cell, Workcell(robot)):  # what it touches where it is may be noise, or may give way
+    cells = (cell, Workcell(robot))  # what it touches where it is may be noise, or may give way
+    for around in cells:
         def free(q: Float[np.ndarray, " n_arm"], kept: float, around: Workcell = around) -> bool:
             return around.free(q, opened, kept)
 
         if (way := free_motion(robot, arm, robot.home, free, HOME_SECONDS, 0)) is not None:
             rig.move(way, still(opened, way))
             return
-    whole = slice(0, made.part(reached).stop)
-    came = made.arm
-    back = _reversed(Trajectory(came.time[whole], came.position[whole], came.velocity[whole], came.acceleration[whole]))
-    rig.move(back, still(opened, back))
+    for around in cells:
+        def clear(way: Trajectory, around: Workcell = around) -> bool:
+            rows = [around.free(q, opened, 0.0) for q in way.position]
+            return any(rows) and all(rows[rows.index(True):])  # but for what it touches where it is
+
+        if (way := timed_way(_back(made, reached), robot.velocity, robot.acceleration, clear)) is not None:
+            rig.move(way, still(opened, way))
+            return
+    met = ", ".join(f"{contact.first} and {contact.second}" for contact in cell.contacts(arm, opened)[:3])
+    raise PlanError(f"the arm does not find its way home{f': {met} touch' if met else ''}; bring it home, and clear again")
+
+
+def _back(made: MotionPlan, reached: str) -> Float[np.ndarray, "k n_arm"]:
+    """Waypoints from the end of a stage back home; after the lift, over the object's place instead of down to it."""
+    rows, whole = made.arm.position, made.part(reached).stop
+    if reached == "close":
+        return rows[:whole][::-1]
+    over = np.stack([rows[made.part("lift").stop - 1], rows[made.part("reach").stop - 1]])
+    return np.concatenate([rows[made.part("lift").stop - 1:whole][::-1], densified(over, SPACING),
+                           rows[:made.part("reach").stop][::-1]])

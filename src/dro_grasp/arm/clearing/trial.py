@@ -16,7 +16,7 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher
 from dro_grasp.arm.tabletop.table_setup import Region, scatter
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName
@@ -63,7 +63,7 @@ class ClearTrial:
     judgements: tuple[tuple[str, bool], ...] = ()
     """What the robot made of its joints each time that it asked, and whether the hand really held something."""
     reason: str = ""
-    """Why nothing was tried."""
+    """Why nothing was tried, or what ended it."""
 
 
 class SimulatedRig:
@@ -121,15 +121,24 @@ def clear_trial(
         return ClearTrial(names, nothing, nothing, Cleared((), ()), reason="a thing rolls off wherever it is put")
     rig = SimulatedRig(scene, config.noise, seed + 1000 * number, watch)
     judgements = list[tuple[str, bool]]()
+    picks, reason = list[Pick](), ""
 
     def judged(check: HoldCheck) -> None:
         judgements.append((check.state, rig.holds()))
         if watch is not None:
             watch.judged(check, judgements[-1][1])
 
-    cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, progress, judged)
+    def picked(pick: Pick) -> None:
+        picks.append(pick)
+        if progress is not None:
+            progress(pick)
+
+    try:
+        cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, picked, judged)
+    except PlanError as error:  # as on a robot, a person has to help; what is removed counts
+        cleared, reason = Cleared(tuple(picks), ()), str(error)
     scene.advance(1.0)
     centres = [(T[:3, :3] @ obj.centre_of_mass + T[:3, 3])[None] for i, obj in enumerate(objects) for T in [scene.pose(i)]]
     fallen = tuple(bool(centre[0, 2] < table.height - LOW) for centre in centres)
     removed = tuple(bool(config.clear.bin.holds(centre)[0]) and not fell for centre, fell in zip(centres, fallen, strict=True))
-    return ClearTrial(names, removed, fallen, cleared, tuple(judgements))
+    return ClearTrial(names, removed, fallen, cleared, tuple(judgements), reason)

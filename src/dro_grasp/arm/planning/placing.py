@@ -34,12 +34,11 @@ GAP = 0.01  # Farthest that an object may stand above what carries it [m] (ours)
 TOP = 0.01  # Points of a thing within this depth below its highest are its top [m] (ours)
 
 
-def check_reach(robot: Robot, spot: Float[np.ndarray, "3"], where: str) -> None:
-    """Refuse a spot of the world [m] that no hand of the robot reaches, by a PlanError."""
+def beyond_reach(robot: Robot, spot: Float[np.ndarray, "3"]) -> str:
+    """What is wrong with a spot of the world [m] that no hand of the robot reaches; nothing if it may reach it."""
     distance, longest = float(np.linalg.norm(spot - robot.T_world_base[:3, 3])), robot.longest_reach
-    if distance > longest:
-        raise PlanError(f"{where} is {distance:.2f} m from the base, farther than the arm and hand are long "
-                        f"({longest:.2f} m); give a place in the robot's world frame [m]")
+    return (f"is {distance:.2f} m from the base, farther than the arm and hand are long ({longest:.2f} m)"
+            if distance > longest else "")
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,8 @@ class Placing:
         """Motions to one spot, or a PlanError that says why there are none."""
         x, y, z = spot
         where = f"the place ({x:.3f}, {y:.3f}, {z:.3f}) m"
-        check_reach(self.cell.robot, spot, where)
+        if far := beyond_reach(self.cell.robot, spot):
+            raise PlanError(f"{where} {far}; give a place in the robot's world frame [m]")
         table = self.cell.robot.table
         if table is not None and z < table.height - SINK:
             raise PlanError(f"{where} is {100 * (table.height - z):.1f} cm below the table at {table.height:.3f} m; give the "

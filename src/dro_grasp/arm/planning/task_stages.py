@@ -84,8 +84,9 @@ def _expected(plan: MotionPlan, names: tuple[str, ...]) -> dict[str, Any]:
     if (known := plan.hold) is None:
         return {}
     ends = (("held", known.held_joints, known.held_efforts), ("empty", known.empty_joints, known.empty_efforts))
-    return {"expected": {state: {"joints": _named(names, joints), "effort": _named(names, efforts)}
-                         for state, joints, efforts in ends}}
+    told: dict[str, Any] = {state: {"joints": _named(names, joints), "effort": _named(names, efforts)}
+                            for state, joints, efforts in ends}
+    return {"expected": told if known.weight is None else {**told, "weight": round(known.weight, DIGITS)}}
 
 
 def _pose(name: str, plan: MotionPlan, robot: Robot, stage: str) -> dict[str, Any]:

@@ -105,8 +105,8 @@ def _zero(file: RobotFile, name: str, turns: bool) -> float:
     zero = file.number(file.drivers["zeros"].get(name, 0.0), f"zeros of joint {name}")
     if abs(zero) > (farthest := 2 * math.pi if turns else FARTHEST_ZERO):
         unit, other = ("rad", "degrees") if turns else ("m", "millimetres")
-        raise file.error(f"zeros of joint {name} is {zero:g} {unit}, as of {other}; expected at most {farthest:.4g} {unit}, in "
-                         "which the description counts")
+        raise file.error(f"zeros of joint {name} is {zero:g}, as if it were in {other}; expected -{farthest:.4g} to "
+                         f"{farthest:.4g} {unit}, as the description counts")
     return zero
 
 

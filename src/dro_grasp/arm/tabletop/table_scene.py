@@ -17,7 +17,7 @@ from dro_grasp.errors import DroGraspError, ObjectError, RobotError
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.perception.choosing import Pixel, Spot, place_of, within
+from dro_grasp.objects.perception.choosing import CLOUD_EDGE, CUT_OFF, Pixel, Spot, place_of, within
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
@@ -117,7 +117,10 @@ def as_picked(found: FoundObject, robot: Robot, scene: Scene) -> PickedObject:
     others = np.zeros((0, 3)) if found.obstacles is None else found.obstacles.points
     level = at_seen_height(robot, found.obj, scene)
     assert level.table is not None
-    obj = replace(found.obj, notes=(*found.obj.notes, *_cut_note(robot, scene, found.chosen.pixels)))
+    cut, notes = _cut_note(robot, scene, found.chosen.pixels), found.obj.notes
+    if cut:  # the camera saw all of it
+        notes = tuple(note for note in notes if not note.startswith(CUT_OFF.format(CLOUD_EDGE)))
+    obj = replace(found.obj, notes=(*notes, *cut))
     return PickedObject(obj, _solid(others, level.table.height), level).noted(robot)
 
 

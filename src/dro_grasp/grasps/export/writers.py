@@ -226,9 +226,12 @@ def _payloads(grasps: GraspBatch) -> str:
 
 
 def _holds(grasps: GraspBatch) -> str:
-    """Comment lines with what to expect of a hold: for each grasp one for each of HOLD_COLUMNS, in the order of the joints."""
-    return "".join(f"# grasp_{i} {name}: {', '.join(map(str, plain(row)))}\n"
-                   for i in range(len(grasps)) for name, row in hold(grasps, i).items())
+    """Comment lines with what to expect of a hold, for each grasp: joints and efforts in the joints' order, and the weight."""
+    lines = list[str]()
+    for i in range(len(grasps)):
+        lines += [f"# grasp_{i} {name}: {', '.join(map(str, plain(row)))}\n" for name, row in hold(grasps, i).items()]
+        lines += [f"# grasp_{i} {name}: {weight}\n" for name, weight in forces(grasps, i).items() if name == WEIGHT_COLUMN]
+    return "".join(lines)
 
 
 def _posture(

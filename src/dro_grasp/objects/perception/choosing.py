@@ -163,7 +163,7 @@ def listed(sight: Sight, segments: Segments) -> str:
         points = world[segments.labels == number]
         size = " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0))
         told.append(f"{size} cm at {place_of(points)}")
-    return "; ".join(told) + ("; ..." if segments.count > TOLD else "")
+    return "; ".join(told) + ("; ..." if segments.count > TOLD else "") or "no thing that stands out"
 
 
 def place_of(points: Float[np.ndarray, "n 3"]) -> str:
@@ -442,6 +442,11 @@ def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], higher:
     return min(fits)[1] if fits else None
 
 
+CLOUD_EDGE = "the cloud's edge"
+CUT_OFF = "it reaches {} and may be cut off there"
+"""What is said of a thing at the border of the image, or at the cloud's edge."""
+
+
 def _cut_off(sight: Sight, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
     """A note where a thing reaches the border of the image, or of the cloud."""
     image = sight.image() if sight.shape is not None else None
@@ -453,8 +458,8 @@ def _cut_off(sight: Sight, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
         flat = sight.points[:, :2] / np.maximum(sight.points[:, 2:], 1e-9) if sight.from_camera else sight.points[:, :2]
         margin = EDGE * np.ptp(flat, axis=0)
         cut = bool((flat[own].min(0) < flat.min(0) + margin).any() or (flat[own].max(0) > flat.max(0) - margin).any())
-        what = "the cloud's edge"
-    return (f"it reaches {what} and may be cut off there: grasps know nothing of the rest. Turn the camera so that all of it "
+        what = CLOUD_EDGE
+    return (f"{CUT_OFF.format(what)}: grasps know nothing of the rest. Turn the camera so that all of it "
             "is seen",) if cut else ()
 
 
