@@ -442,7 +442,7 @@ def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], higher:
     return min(fits)[1] if fits else None
 
 
-CLOUD_EDGE = "the cloud's edge"
+CLOUD_EDGE = "the cloud's edge"  # Where a cloud without an image ends
 CUT_OFF = "it reaches {} and may be cut off there"
 """What is said of a thing at the border of the image, or at the cloud's edge."""
 
