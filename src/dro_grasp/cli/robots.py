@@ -87,7 +87,7 @@ class Plan:
     least_confidence: Annotated[float | None, optional("P", "0.2 with --rehearsals 0, else 0.12")] = None
     """Grasps that hold with less probability are not tried; 0 tries all. By default, the last of three batches also tries
     those that hold the object when rehearsed."""
-    planner_seconds: float = 3.0  # Longest time for one path [s].
+    planner_seconds: float = 3.0  # Longest processor time for one path [s].
     seed: int = 0  # Seed of grasps, inverse kinematics and planner.
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""

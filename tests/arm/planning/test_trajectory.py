@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,30 @@ def test_a_path_goes_round_a_wall_to_the_goal_that_can_be_reached() -> None:
     assert again is not None
     assert np.array_equal(again[0], waypoints)
     assert find_path(start, goals[:1], free, low, high, 0.3, 0) is None
+
+
+def test_a_machine_that_is_busy_finds_the_same_path() -> None:
+    low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+    start, goal = np.array([-0.8, 0.0]), np.array([[0.8, 0.0]])
+
+    def found(pause: float) -> np.ndarray | None:
+        checks = 0
+
+        def free(q: np.ndarray) -> bool:
+            nonlocal checks
+            checks += 1
+            if checks in (10, 20, 30):
+                time.sleep(pause)  # others have the processor
+            return not (abs(q[0]) < 0.2 and q[1] < 0.6)
+
+        path = find_path(start, goal, free, low, high, 0.5, 0)
+        assert checks > 30
+        return None if path is None else path[0]
+
+    quiet, busy = found(0.0), found(0.3)
+    assert quiet is not None
+    assert busy is not None
+    assert np.array_equal(quiet, busy)
 
 
 def test_one_joint_takes_the_time_that_a_trapezoid_takes() -> None:

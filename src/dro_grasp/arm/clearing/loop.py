@@ -32,7 +32,7 @@ from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
-HOME_SECONDS = 5.0  # Longest time for a path home [s] (ours)
+HOME_SECONDS = 5.0  # Longest processor time for a path home [s] (ours)
 WALL = 0.01  # Thickness of the bin's walls [m] (ours)
 BESIDE = 0.03  # Distance from the bin within which what is seen counts as the bin [m] (ours): its walls are seen with noise
 WATCHED = 21  # How often joints are measured to see whether something slips (ours)

@@ -76,7 +76,7 @@ class SlideConfig(Checked):
     grips: int = 40
     """Grasps at the edge of which the arm has to reach one, before a thing is pushed there."""
     path_seconds: float = 2.0
-    """Longest time for a path to the thing, and for the way home [s]."""
+    """Longest processor time for a path to the thing, and for the way home [s]."""
     rehearsed: bool = True
     """Whether pushes after which it falls off the table, when they are simulated on what is known of it, are left out."""
     friction: float = FRICTION

@@ -77,9 +77,9 @@ class PlanConfig(Checked):
     """Distance that fingers keep in pregrasp from an object of which a side is a guess [m]: in the first of several batches,
     unless the constraints ask for another; 0 for none."""
     best_seconds: float = 1.0
-    """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
+    """Longest processor time for a path to the best grasp alone, tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
-    """Longest time for one path to several goals [s]."""
+    """Longest processor time for one path to several goals [s]."""
     closing_seconds: float = 1.0
     """Least time in which the hand closes [s]. Source: as in trials."""
     grip_seconds: float = 0.5

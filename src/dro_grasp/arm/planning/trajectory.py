@@ -6,6 +6,7 @@ Paths are of OMPL (RRT-Connect), and end at the first of several goals that can 
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 from collections.abc import Callable
 from itertools import pairwise
@@ -42,7 +43,7 @@ def find_path(
     """Dense waypoints [rad or m] from the start to one of the goals, and its index; None if no path is found in `seconds`.
 
     Start and goals are free; the planner tries the goals in their order, and takes the one that it connects first. OMPL's
-    generators, which the seed is of, are its own.
+    generators, which the seed is of, are its own. The limit is of processor time, so that a busy machine finds the same path.
     """
     from ompl import base as ob, geometric as og, util as ou
 
@@ -54,6 +55,10 @@ def find_path(
 
     def values(state: Any) -> Float[np.ndarray, " n"]:
         return np.array([state[i] for i in range(len(start))])
+
+    def after(seconds: float) -> Any:
+        end = time.thread_time() + seconds
+        return ob.PlannerTerminationCondition(lambda: time.thread_time() > end)
 
     ou.setLogLevel(ou.LOG_NONE)
     ou.RNG.setSeed(seed + 1)  # OMPL takes zero for no seed
@@ -76,10 +81,10 @@ def find_path(
     planner = og.RRTConnect(information)
     planner.setRange(0.6)  # longest edge of the trees [rad] (ours)
     setup.setPlanner(planner)
-    setup.solve(seconds)
+    setup.solve(after(seconds))
     if not setup.haveExactSolutionPath():  # `solve` is content with approximate paths
         return None
-    setup.simplifySolution(3.0)  # seconds (ours): it ends by itself long before, but on a busy machine
+    setup.simplifySolution(after(3.0))  # seconds (ours): it ends by itself long before
     corners = np.array([values(s) for s in setup.getSolutionPath().getStates()])
     corners[0] = start
     return densified(corners, SPACING), int(np.linalg.norm(goals - corners[-1], axis=1).argmin())
@@ -105,8 +110,8 @@ def free_motion(
         start: Where it begins [rad or m].
         end: Where it ends.
         free: Whether a configuration keeps a distance [m] from things.
-        seconds: Longest time for the path.
-        seed: See `find_path`.
+        seconds: See `find_path`.
+        seed: Likewise.
         clearance: Distance that the path keeps [m].
     """
     found = find_path(start, end[None], lambda q: free(q, clearance), *robot.working_range, seconds, seed)
