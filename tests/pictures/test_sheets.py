@@ -254,3 +254,11 @@ def test_a_long_title_over_few_pictures_is_not_cut() -> None:
     inked = [int(np.flatnonzero((sheet[:HEADER] < 200).any((0, 2))).max()) for sheet in sheets]
     assert inked[1] > 1.9 * inked[0], "all of its letters are there"
     assert all(right < sheet.shape[1] - 8 for right, sheet in zip(inked, sheets, strict=True))
+
+
+def test_a_long_caption_is_not_cut_and_does_not_run_into_its_neighbour() -> None:
+    tiles, text = [np.full((30, 60, 3), 255, np.uint8)] * 2, "11   success   confidence 97 %   carries 0.99 kg"
+    alone = np.asarray(pictures.contact_sheet(tiles[:1], [(text, True)], ""))[-CAPTION:]
+    beside = np.asarray(pictures.contact_sheet(tiles, [(text, True), (text, True)], "", columns=2))[-CAPTION:]
+    assert (alone[:, -8:] == 255).all()
+    assert np.array_equal(beside, np.concatenate([alone, alone], 1))

@@ -230,21 +230,22 @@ def contact_sheet(
     tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str,
     columns: int = 4, outcomes: bool = True,
 ) -> Image.Image:
-    """A grid of captioned pictures under a title; the captions tell the outcomes in colour, unless there are none."""
+    """A grid of captioned pictures under a title, as wide as captions need; these tell outcomes in colour, if there are any."""
     height, width = tiles[0].shape[:2]
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
     font, large = ImageFont.load_default(14), ImageFont.load_default(18)
-    wide = max(columns * width, math.ceil(large.getlength(title)) + 32)
+    left = 34 if outcomes else 16
+    cell = max(width, left + math.ceil(max(font.getlength(text) for text, _ in captions)) + 8)
+    wide = max(columns * cell, math.ceil(large.getlength(title)) + 32)
     sheet = Image.new("RGB", (wide, HEADER + rows * (height + CAPTION)), (255, 255, 255))
     pen = ImageDraw.Draw(sheet)
     pen.text((16, 12), title, fill=INK, font=large)
     for i, (tile, (text, passed)) in enumerate(zip(tiles, captions, strict=True)):
-        x, y = (i % columns) * width, HEADER + (i // columns) * (height + CAPTION)
-        sheet.paste(Image.fromarray(tile), (x, y))
+        x, y = (i % columns) * cell, HEADER + (i // columns) * (height + CAPTION)
+        sheet.paste(Image.fromarray(tile), (x + (cell - width) // 2, y))
         if outcomes:
             red, green, blue = (int(255 * c) for c in success_colour(passed))
             pen.ellipse((x + 16, y + height + 5, x + 26, y + height + 15), fill=(red, green, blue))
-        left = x + (34 if outcomes else 16)
-        pen.text((left, y + height + 1), text, fill=INK if passed is not None else FAINT, font=font)
+        pen.text((x + left, y + height + 1), text, fill=INK if passed is not None else FAINT, font=font)
     return sheet
