@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dro_grasp.predict.config import GraspRequest
 from lab.published_hands import HANDS as PUBLISHED
 
 PREPARED = "out/results"
@@ -29,6 +30,8 @@ HARD = "builtin:hard_test"
 """Thin, flat, hollow, small, large and heavy ones, by which nothing was chosen."""
 MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
+HALF = GraspRequest.candidates // 2
+"""Half of the candidates that `generate` makes at most for each grasp."""
 FLAT_THINGS = ("ballpoint_pen", "bank_card", "dinner_plate", "table_fork", "hardcover_book", "scissors")
 """Flat and thin things, by which nothing was chosen."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
@@ -92,6 +95,12 @@ def _headline() -> dict[str, str]:
     return cells
 
 
+def _half() -> dict[str, str]:
+    return {f"{where}, {_short(hand)}": _benchmark(
+        "auto", hand, objects, f"--num 32 --candidates {HALF} --stages returned --protocols {FAST}")
+        for where, objects in (OBJECTS | {"hard": HARD}).items() for hand in PAPER_HANDS}
+
+
 def _unseen() -> dict[str, str]:
     cells = {}
     for hand in UNSEEN_HANDS:
@@ -139,6 +148,7 @@ MEASUREMENTS = {
     "hard": Measurement("The paper's hands on hard objects", {
         _short(hand): _benchmark("auto", hand, HARD, f"--num 32 --stages returned --protocols {ALL}")
         for hand in PAPER_HANDS}),
+    "half": Measurement("The same three groups of objects, with half of the candidates", _half()),
     "published_hard": Measurement("Hands as others publish them, on hard objects", {
         name: _benchmark("auto", shlex.quote(f"{PREPARED}/published/{path}"), HARD,
                          f"--num 32 --stages returned --protocols {ALL}")

@@ -7,14 +7,17 @@ import dataclasses
 import functools
 import json
 import math
+import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.compare.metrics import success_rate
-from dro_grasp.compare.rows import ALL, Row
-from lab.measurements import MEASUREMENTS
+from dro_grasp.compare.rows import ALL, Row, average
+from lab.measurements import MEASUREMENTS, PAPER_HANDS, SEEN_IN_PART
 from lab.runner import RESULTS
+from lab.studies import payload
 
 Cell = dict[str, Any]
 PROTOCOLS = ("carry", "robust", "dexgraspbench", "strict", "dro")
@@ -72,6 +75,45 @@ def _cells(path: Path) -> dict[str, Cell]:
 def as_row(line: dict[str, Any]) -> Row:
     """A row as it was before it was printed."""
     return Row(**{field.name: _numbers(line[field.name]) for field in dataclasses.fields(Row)})
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Grasps of one tenth of confidence."""
+
+    tenth: int
+    n: int
+    predicted: float  # mean confidence
+    held: int
+
+
+def confidence_bins(results: Results, in_part: bool = False) -> list[Bin]:
+    """Predicted beside observed: of hands that no weights were trained on, or of objects seen in part."""
+    known = tuple(map(plain, PAPER_HANDS))
+    names = [name for name in MEASUREMENTS["confidence"].cells
+             if (name.endswith(SEEN_IN_PART) if in_part else not name.startswith(known))]
+    bins, found = [b for name in names for b in results.cell("confidence", name)["bins"]], []
+    for tenth in range(10):
+        own = [b for b in bins if round(10 * b["from"]) == tenth]
+        if n := sum(b["n"] for b in own):
+            predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
+            found.append(Bin(tenth, n, predicted / n, round(held)))
+    return found
+
+
+def payload_errors(results: Results) -> tuple[float, float, int, int]:
+    """Median errors of stated payloads and of repeated trials [%]; how many grasps held a mass in trials, and how many none."""
+    rows = [row for found in results.cells("payload").values() for row in found["rows"]]
+    held = [row for row in rows if row["trials"] > payload.INTERVALS[0][0]]
+    stated, again = (
+        100 * statistics.median(abs(row[way] / row["trials"] - 1) for row in held) for way in (payload.WEIGHED, payload.AGAIN))
+    return stated, again, len(held), len(rows) - len(held)
+
+
+def with_half(results: Results, where: str) -> tuple[Row, Row]:
+    """What is returned on one group of objects with all candidates, and with half of them; the mean of the paper's hands."""
+    every = results.rows("hard") if where == "hard" else results.rows("headline", where, "returned")
+    return average(every), average(results.rows("half", where))
 
 
 def _numbers(value: Any) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -18,12 +17,25 @@ from typing import Any
 from dro_grasp.compare.rows import average
 from lab import pages, targets
 from lab.benchmarks.report import ROOT
-from lab.figure import CONTROLS, FIGURE, METHODS, draw_figure, figure_data
-from lab.measurements import MEASUREMENTS, PAPER_HANDS, ROBOTS, SEEN_IN_PART
-from lab.reading import HEAD, MissingResult, Results, as_row, line, of, plain, select, state_of, table
+from lab.figure import CONTROLS, FIGURES, METHODS
+from lab.measurements import ROBOTS
+from lab.reading import (
+    HEAD,
+    MissingResult,
+    Results,
+    as_row,
+    confidence_bins,
+    line,
+    of,
+    payload_errors,
+    plain,
+    select,
+    state_of,
+    table,
+    with_half,
+)
 from lab.robot_tables import any_grasp, lifted, planning, robot_tasks
 from lab.runner import RESULTS
-from lab.studies import payload
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Pages that have markers."""
@@ -98,6 +110,15 @@ def hands(results: Results, measurement: str) -> str:
     return table([*HEAD, "optimiser's [%]"], [*lines, line("**all**", every, f"{100 * every.optimised:.0f}")])
 
 
+def half(results: Results) -> str:
+    """What is returned with half of the candidates, beside all of them."""
+    lines = []
+    for where, text in (("validate", "the paper's objects"), ("test", "built-in test objects"), ("hard", "hard objects")):
+        every, halved = with_half(results, where)
+        lines += [line(f"{text}, four candidates", every), line(f"{text}, two", halved)]
+    return table(HEAD, lines)
+
+
 def views(results: Results) -> str:
     """What is seen of the object, and what holds."""
     text = {"cloud": "points of the whole surface", "half": "half of the points, as in the paper", "depth": "one depth image"}
@@ -141,17 +162,10 @@ def flat(results: Results) -> str:
 
 
 def confidence(results: Results, in_part: bool) -> str:
-    """Predicted beside observed, in ten bins: of hands that no weights were trained on, or of objects seen in part."""
-    known = tuple(map(plain, PAPER_HANDS))
-    names = [name for name in MEASUREMENTS["confidence"].cells
-             if (name.endswith(SEEN_IN_PART) if in_part else not name.startswith(known))]
-    bins, lines = [b for name in names for b in results.cell("confidence", name)["bins"]], []
-    for k in range(10):
-        own = [b for b in bins if round(10 * b["from"]) == k]
-        if n := sum(b["n"] for b in own):
-            predicted, held = (sum(b[key] * b["n"] for b in own) for key in ("predicted", "observed"))
-            lines.append([f"{10 * k} to {10 * k + 10}", n, f"{100 * predicted / n:.0f}", of(round(held), n)])
-    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]"], lines)
+    """Predicted beside observed, in ten bins."""
+    return table(["confidence [%]", "grasps", "predicted [%]", "held [%]"], [
+        [f"{10 * b.tenth} to {10 * b.tenth + 10}", b.n, f"{100 * b.predicted:.0f}", of(b.held, b.n)]
+        for b in confidence_bins(results, in_part)])
 
 
 def methods(results: Results) -> str:
@@ -274,12 +288,9 @@ def training_told(results: Results) -> str:
 
 def payload_error(results: Results) -> str:
     """Median error of stated payloads, of trials that were repeated, and of how many grasps."""
-    rows = [row for found in results.cells("payload").values() for row in found["rows"]]
-    held = [row for row in rows if row["trials"] > payload.INTERVALS[0][0]]
-    stated, again = (
-        100 * statistics.median(abs(row[way] / row["trials"] - 1) for row in held) for way in (payload.WEIGHED, payload.AGAIN))
-    return (f"{stated:.0f} % in the median of {len(held)} grasps (trials repeated: {again:.0f} %; {len(rows) - len(held)} more "
-            "held no mass in trials)")
+    stated, again, held, none = payload_errors(results)
+    return (f"{stated:.0f} % in the median of {held} grasps (trials repeated: {again:.0f} %; {none} more held no mass in "
+            "trials)")
 
 
 TABLES: dict[str, Callable[[Results], str]] = {
@@ -292,6 +303,7 @@ TABLES: dict[str, Callable[[Results], str]] = {
     "unseen.hands": unseen,
     "procedural.hands": functools.partial(hands, measurement="procedural"),
     "published.hands": functools.partial(hands, measurement="published"),
+    "half.objects": half,
     "hard.hands": functools.partial(hands, measurement="hard"),
     "published_hard.hands": functools.partial(hands, measurement="published_hard"),
     "views.views": views,
@@ -364,7 +376,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for page in changed:
         print(page.relative_to(ROOT))
     if not options.check:
-        draw_figure(figure_data(Results()), FIGURE)
+        for each in FIGURES:
+            each.draw(each.data(Results()), each.path)
     return int(options.check and bool(changed))
 
 

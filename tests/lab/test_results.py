@@ -21,8 +21,9 @@ def test_pages_are_what_their_data_say() -> None:
     assert [str(page.relative_to(runner.ROOT)) for page, _ in tables.outdated()] == []
 
 
-def test_the_figure_is_of_its_data() -> None:
-    assert not figure.figure_is_old(), "run `make tables`"
+@pytest.mark.parametrize("each", figure.FIGURES, ids=lambda each: each.path.stem)
+def test_a_figure_is_of_its_data(each: figure.Figure) -> None:
+    assert not each.is_old(), "run `make tables`"
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
@@ -91,12 +92,13 @@ def test_what_was_not_measured_says_so(tmp_path: Path) -> None:
         "not measured (`make results NAMES=constraints`)")
 
 
-def test_a_figure_of_what_was_not_measured_says_so(tmp_path: Path) -> None:
+@pytest.mark.parametrize("each", figure.FIGURES, ids=lambda each: each.path.stem)
+def test_a_figure_of_what_was_not_measured_says_so(each: figure.Figure, tmp_path: Path) -> None:
     from PIL import Image
 
-    nothing = figure.figure_data(tables.Results(tmp_path))
+    nothing = each.data(tables.Results(tmp_path))
     assert nothing == {}
-    figure.draw_figure(nothing, tmp_path / "figure.png")
+    each.draw(nothing, tmp_path / "figure.png")
     with Image.open(tmp_path / "figure.png") as image:
         assert image.text["Description"] == figure.digest({})
 

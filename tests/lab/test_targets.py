@@ -64,3 +64,29 @@ def test_published_hands_are_counted_in_their_last_state() -> None:
     last = [[line for line in lines if line["hand"] == hand][-1] for hand in hands]
     assert found.value == sum(line["accepted"] == "yes" for line in last)
     assert found.told.endswith(f"of {len(hands)}")
+
+
+def test_confidence_is_off_by_its_worst_tenth_with_enough_grasps(tmp_path: Path) -> None:
+    bins = [{"from": 0.1, "to": 0.2, "n": 29, "predicted": 0.15, "observed": 1.0, "low": 0.9, "high": 1.0},
+            {"from": 0.4, "to": 0.5, "n": 10, "predicted": 0.45, "observed": 0.6, "low": 0.3, "high": 0.9}]
+    cells = {name: {**CELL, "command": command, "result": {"bins": bins if name.startswith("made") else bins[1:]}}
+             for name, command in MEASUREMENTS["confidence"].cells.items()}
+    (tmp_path / "confidence.json").write_text(json.dumps({"cells": cells}))
+    assert targets.worst_tenth(Results(tmp_path)).told == "85 of 58 from 10 %", "twice 29, of made hands"
+    bins[0]["n"] = 14
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "confidence.json").write_text(json.dumps({"cells": cells}))
+    found = targets.worst_tenth(Results(tmp_path / "other"))
+    assert found.value == pytest.approx(15)
+    assert found.told.endswith(" from 40 %"), "28 are too few to tell"
+
+
+def test_half_of_the_candidates_loses_the_most_on_one_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    held = {"validate": (1.0, 0.99), "test": (0.95, 0.97), "hard": (0.8, 0.76)}
+    monkeypatch.setattr(targets, "with_half", lambda results, where: [
+        SimpleNamespace(success={"carry": (rate, 0, 1)}) for rate in held[where]])
+    found = targets.lost_by_half(Results(tmp_path))
+    assert found.value == pytest.approx(4)
+    assert found.told == "4.0: 76.0 of 80.0, hard"

@@ -54,6 +54,7 @@ class Benchmark:
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
     """Grasps that hold with less probability are not returned, and count as failures; 0 returns all."""
+    candidates: int = 4  # Most candidates for each grasp of stage returned, as in `generate`.
     controls: bool = True  # Without --methods: also evaluate start, optimiser and, with a bundle, the mean grasp.
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle whose grasps are averaged to the mean grasp."""
@@ -83,7 +84,7 @@ class Benchmark:
 
         if self.quick:
             return dataclasses.replace(self, quick=False, **QUICK, objects=tuple(resolve_objects(list(self.objects))[:2])).run()
-        GraspRequest(self.num, candidates=1, temperature=self.temperature, least_confidence=self.least_confidence)
+        GraspRequest(self.num, candidates=self.candidates, temperature=self.temperature, least_confidence=self.least_confidence)
         if self.views < 1:
             raise OptionError(f"--views is {self.views}; give at least 1")
         for name in ("hands", "objects", "stages", "protocols"):
@@ -152,7 +153,7 @@ class Benchmark:
             controls = ("start", "optimiser", *(("mean-grasp", "mean-grasp-chosen") if self.bundle is not None else ()))
             names = ("auto", *(controls if self.controls else ()))
         bundle = None if self.bundle is None else load_bundle(self.bundle)
-        options = MethodOptions(self.weights, self.device, self.temperature, bundle, least_confidence=self.least_confidence)
+        options = MethodOptions(self.weights, self.device, self.temperature, bundle, self.candidates, self.least_confidence)
         return [make_method(name, options) for name in dict.fromkeys(names)]
 
 
