@@ -27,6 +27,15 @@ class ObjectError(DroGraspError):
     """A mesh or point cloud of an object cannot be used."""
 
 
+class UngraspableError(ObjectError):
+    """What was given is no thing for a hand to grasp, and may still be in its way: an image, a sheet, of another size."""
+
+    def __init__(self, fault: str, advice: str) -> None:
+        super().__init__(f"{fault}{advice}")
+        self.fault = fault
+        """What is wrong, without what to do for grasping it."""
+
+
 class GraspFileError(DroGraspError):
     """A grasp file is truncated, foreign, or of another version."""
 

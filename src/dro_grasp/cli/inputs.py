@@ -22,8 +22,6 @@ Ball = tuple[float, float, float, float]  # Centre and radius [m]
 Mass = Annotated[float | None, tyro.conf.arg(metavar="KG", help_behavior_hint="(default: density times volume)")]
 Friction = Annotated[float, tyro.conf.arg(
     metavar="MU", help="Friction between hand, objects and table, in simulation and in the planner's rehearsals.")]
-AVOIDED = ("for a hand to grasp", "If it is a depth image", "is an open sheet", "encloses no volume")
-"""What is said of things of other sizes, images and sheets, which are no things to grasp, and may still be in the way."""
 Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 
@@ -38,19 +36,15 @@ def load_obstacle(name: str) -> ObjectModel:
     Raises:
         ObjectError: It cannot be loaded as a thing; of one of another size, and of a sheet, the message says how it is avoided.
     """
-    from dro_grasp.errors import ObjectError
+    from dro_grasp.errors import ObjectError, UngraspableError
     from dro_grasp.objects.catalogue import load_object
 
     try:
         return load_object(name)
-    except ObjectError as error:
-        if not any(refused in str(error) for refused in AVOIDED):
-            raise
-        size, grasped, _ = str(error).partition(AVOIDED[0])  # After it follow words on scenes and scales
-        told = f"{size}for an obstacle" if grasped else size.partition(f". {AVOIDED[1]}")[0]
-        advice = ("--obstacles takes clouds and meshes of things, in metres, 5 mm to 1 m large, meshes with an inside; "
-                  "all else to stay clear of is given with --surroundings, a mesh or cloud of any size")
-        raise ObjectError(f"{told}. {advice}") from error
+    except UngraspableError as error:
+        raise ObjectError(
+            f"{error.fault}. --obstacles takes clouds and meshes of things, in metres, 5 mm to 1 m large, meshes with an "
+            "inside; all else to stay clear of is given with --surroundings, a mesh or cloud of any size") from error
 
 
 @dataclass(frozen=True)

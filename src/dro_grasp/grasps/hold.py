@@ -54,6 +54,11 @@ class HoldExpectation:
     weight: float | None = None
     """Of the object [N]; None where nobody knows."""
 
+    @property
+    def ends(self) -> dict[str, tuple[Float[np.ndarray, " n_dof"], Float[np.ndarray, " n_dof"]]]:
+        """Joints and efforts of both, by the names that files give them."""
+        return {"held": (self.held_joints, self.held_efforts), "empty": (self.empty_joints, self.empty_efforts)}
+
     @staticmethod
     def of(grasps: GraspBatch, index: int) -> HoldExpectation | None:
         """Those of one grasp; None where `expect_hold` has not been asked.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 from scipy.spatial import KDTree, QhullError
 
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, UngraspableError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.mesh_files import trimesh
@@ -252,16 +252,17 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
     if largest <= 0:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
     size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give "
-                      f"{_scale_hint(largest / scale, origin)}")
+    raise UngraspableError(f"{origin} measures {size}", " for a hand to grasp; if its unit is not the metre, give "
+                           f"{_scale_hint(largest / scale, origin)}")
 
 
 def check_view(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
     """Refuse clouds of implausible sizes, as `check_extent` does; those as large as a view may be one."""
     largest = float(np.ptp(points, axis=0).max())
     if LARGEST < largest <= FARTHEST_VIEW:
-        raise ObjectError(f"{origin} measures {largest:.4g} m, too large for a hand to grasp; if it is a camera's view in "
-                          f"metres, {AS_SCENE}; if its unit is not the metre, give {_scale_hint(largest / scale, origin)}")
+        raise UngraspableError(f"{origin} measures {largest:.4g} m, too large", " for a hand to grasp; if it is a camera's "
+                               f"view in metres, {AS_SCENE}; if its unit is not the metre, give "
+                               f"{_scale_hint(largest / scale, origin)}")
     check_extent(points, origin, scale)
 
 
@@ -304,9 +305,9 @@ def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
         raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
                           "alone; join the faces (merge vertices), or give a point cloud of the surface")
     if (border := _border(mesh)) > BORDER and _is_sheet(_wound(mesh)):
-        raise ObjectError(f"{origin} is an open sheet and encloses nothing: {border:.0%} of the length of the edges of its "
-                          f"{len(mesh.faces)} faces belongs to one face alone; close it, give it a thickness, or give a point "
-                          "cloud of the surface")
+        raise UngraspableError(f"{origin} is an open sheet and encloses nothing: {border:.0%} of the length of the edges of "
+                               f"its {len(mesh.faces)} faces belongs to one face alone",
+                               "; close it, give it a thickness, or give a point cloud of the surface")
 
 
 def _border(mesh: trimesh.Trimesh) -> float:
@@ -366,8 +367,8 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
     hull = _hull(mesh)
     box = float(np.prod(mesh.extents))
     if hull is None or hull.volume < max(LEAST_FILL * box, 1e-9):  # [m^3] (ours)
-        raise ObjectError(f"{origin} encloses no volume (extents {np.round(mesh.extents * 1000, 2).tolist()} mm); "
-                          "give a closed solid, or a point cloud if only its surface is known")
+        raise UngraspableError(f"{origin} encloses no volume (extents {np.round(mesh.extents * 1000, 2).tolist()} mm)",
+                               "; give a closed solid, or a point cloud if only its surface is known")
     if _is_solid(mesh) and LEAST_FILL * hull.volume < _volume(mesh) <= (1 + OVERLAP) * hull.volume:
         return _of_solid(mesh)
     winding, points, cell = _winding(mesh)

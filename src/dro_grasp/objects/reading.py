@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Num, Shaped
 from torch import Tensor
 
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, UngraspableError
 from dro_grasp.files import reading
 from dro_grasp.geometry.mesh_files import check_bytes, open_mesh, trimesh
-from dro_grasp.objects.perception.things import AS_SCENE
+from dro_grasp.objects.perception.things import AS_IMAGE
 
 ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene | tuple[Any, Any] | Num[np.ndarray, "..."]
                 | Num[Tensor, "..."])
@@ -70,8 +70,7 @@ def refuse_image(array: Shaped[np.ndarray, "..."], origin: str) -> None:
     if is_image(array):
         if len(array) == 3:
             raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points: transpose it")
-        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points. If it is a depth image, "
-                          f"{AS_SCENE}; the camera's file states the intrinsics")
+        raise UngraspableError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points", AS_IMAGE)
 
 
 def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -90,8 +89,7 @@ def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
     if path.suffix.lower() in IMAGES:
-        raise ObjectError(f"{path} is an image, and no mesh or cloud. If it is a depth image, {AS_SCENE}; the camera's file "
-                          "states the intrinsics")
+        raise UngraspableError(f"{path} is an image, and no mesh or cloud", AS_IMAGE)
     if path.suffix.lower() in CLOUD_SUFFIXES:
         return read_cloud(path), 1.0
     # trimesh alone is called here, and its many readers raise whatever they stumble over.

@@ -191,8 +191,3 @@ def place_on_thing(scene: Scene, number: int) -> Float[np.ndarray, "3"]:
             alone &= ~((own >= box.min(0)) & (own <= box.max(0))).all(1)
     kept = own[alone] if alone.any() else own
     return kept[len(kept) // 2]
-
-
-def size_in_words(points: Float[np.ndarray, "n 3"]) -> str:
-    """Extents of points [m]."""
-    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0)) + " cm"

@@ -18,15 +18,15 @@ from dro_grasp.apps.library import Library
 from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES
 from dro_grasp.apps.viewer.grasp_page import GRASP_FILE, exported
 from dro_grasp.apps.viewer.hand_view import GraspMarks, HandView, colour_of
-from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud, place_on_thing, size_in_words
+from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud, place_on_thing
 from dro_grasp.apps.viewer.scene_view import Client, Closed, Page, escaped, rgb
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.forces import known
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.perception.choosing import place_of
 from dro_grasp.objects.perception.segmentation import STRUCTURE
+from dro_grasp.objects.perception.things import place_of, size_of
 from dro_grasp.objects.scenery import FoundObject, Scene, load_scene
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
@@ -184,7 +184,7 @@ class ScenePage(Page):
         return self.cloud.camera()
 
     def _thing_name(self, number: int) -> str:
-        return f"{number + 1}: {size_in_words(self.cloud.world[self.cloud.labels == number])}"
+        return f"{number + 1}: {size_of(self.cloud.world[self.cloud.labels == number])}"
 
     # What browsers ask for
 
@@ -320,7 +320,7 @@ class ScenePage(Page):
     def _notes(self, wish: Wish, found: FoundObject) -> str:
         """What was taken, and what is uncertain about it, in Markdown."""
         own = wish.cloud.world[found.chosen.own]
-        taken = f"{len(own)} points, {size_in_words(own)}, at {place_of(own)} m"
+        taken = f"{len(own)} points, {size_of(own)}, at {place_of(own)} m"
         return "  \n".join([taken, *(f"⚠ {escaped(note)}." for note in found.chosen.notes)])
 
     def _offered(self, wish: Wish, found: FoundObject) -> Offer:

@@ -335,9 +335,7 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
             "position": _plain(of_hand.positions(plan.squeeze)),
             "effort": _plain(of_hand.efforts(np.array(notes.squeeze_torque)))}
     if hold is not None:
-        driven = of_hand.holding(hold)
-        for name, joints, forces in (("held", driven.held_joints, driven.held_efforts),
-                                     ("empty", driven.empty_joints, driven.empty_efforts)):
+        for name, (joints, forces) in of_hand.holding(hold).ends.items():
             messages[name] = {"header": _header(notes.frame), "name": list(notes.hand_joints), "velocity": [],
                               "position": _plain(joints), "effort": _plain(forces)}
     units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"

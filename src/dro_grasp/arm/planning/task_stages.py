@@ -83,9 +83,8 @@ def _expected(plan: MotionPlan, names: tuple[str, ...]) -> dict[str, Any]:
     """What to expect of a hold; nothing in plans that do not know."""
     if (known := plan.hold) is None:
         return {}
-    ends = (("held", known.held_joints, known.held_efforts), ("empty", known.empty_joints, known.empty_efforts))
     told: dict[str, Any] = {state: {"joints": _named(names, joints), "effort": _named(names, efforts)}
-                            for state, joints, efforts in ends}
+                            for state, (joints, efforts) in known.ends.items()}
     return {"expected": told if known.weight is None else {**told, "weight": round(known.weight, DIGITS)}}
 
 

@@ -17,7 +17,8 @@ from dro_grasp.errors import DroGraspError, ObjectError, RobotError
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.perception.choosing import CLOUD_EDGE, CUT_OFF, Pixel, Spot, place_of, within
+from dro_grasp.objects.perception.choosing import CLOUD_EDGE, CUT_OFF, Pixel, Spot, within
+from dro_grasp.objects.perception.things import place_of, size_of
 from dro_grasp.objects.scenery import FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
 
@@ -108,7 +109,7 @@ def found_on_table(
         if beyond.max() <= 0:
             raise
         lies = "is beside" if beyond.min() > 0 else f"reaches {beyond.max():.0f} cm over the edge of"
-        raise ObjectError(f"'{scene.name}' shows a thing there, of {_size(points)} at {place_of(points)}, but it {lies} the "
+        raise ObjectError(f"'{scene.name}' shows a thing there, of {size_of(points)} at {place_of(points)}, but it {lies} the "
                           f"{_stated(robot)}. {CORRECT}. On the table: {error}") from error
 
 
@@ -144,8 +145,8 @@ def _cut_note(robot: Robot, scene: Scene, pixels: Int[np.ndarray, " k"], mask: A
         return ()
     beyond = 100 * float(overhang(world[thing], _table(robot, scene.name)).max())
     return (f"it reaches {beyond:.0f} cm over the edge of the {_stated(robot)}, and what is more than {100 * OVERHANG:.0f} cm "
-            f"beyond the edge, or hangs below it, is left out: {_size(world[own])} of the {_size(world[thing])} that are seen "
-            f"are taken. {CORRECT}",)
+            f"beyond the edge, or hangs below it, is left out: {size_of(world[own])} of the {size_of(world[thing])} that are "
+            f"seen are taken. {CORRECT}",)
 
 
 def _stated(robot: Robot) -> str:
@@ -153,10 +154,6 @@ def _stated(robot: Robot) -> str:
     assert robot.table is not None
     (x, y), (width, depth) = robot.table.centre, robot.table.size
     return f"table of robot '{robot.name}', which its file states to be {width:g} x {depth:g} m about x = {x:g}, y = {y:g} m"
-
-
-def _size(points: Float[np.ndarray, "n 3"]) -> str:
-    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0)) + " cm"
 
 
 def picked_flat(scene: Scene, robot: Robot, mask: Any, name: str | None = None) -> PickedObject | None:

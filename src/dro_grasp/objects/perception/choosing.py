@@ -16,6 +16,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.raised import joined_rest, raised
 from dro_grasp.objects.perception.segmentation import BACK, NOTHING, OTHER, SPECK, STRUCTURE, Segments
+from dro_grasp.objects.perception.things import place_of, size_of
 from dro_grasp.objects.reading import numbers
 
 Spot = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # x, y, z [m]
@@ -161,14 +162,8 @@ def listed(sight: Sight, segments: Segments) -> str:
     told = []
     for number in range(min(segments.count, TOLD)):
         points = world[segments.labels == number]
-        size = " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0))
-        told.append(f"{size} cm at {place_of(points)}")
+        told.append(f"{size_of(points)} at {place_of(points)}")
     return "; ".join(told) + ("; ..." if segments.count > TOLD else "") or "no thing that stands out"
-
-
-def place_of(points: Float[np.ndarray, "n 3"]) -> str:
-    """The middle of points in words [m]."""
-    return " ".join(f"{value + 0.0:.2f}" for value in (points.min(0) + points.max(0)) / 2)
 
 
 def _planes(segments: Segments) -> str:

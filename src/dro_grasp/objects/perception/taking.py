@@ -10,9 +10,10 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
-from dro_grasp.objects.perception.choosing import Chosen, Sight, place_of
+from dro_grasp.objects.perception.choosing import Chosen, Sight
 from dro_grasp.objects.perception.scan import scanned_object
 from dro_grasp.objects.perception.segmentation import Segments
+from dro_grasp.objects.perception.things import place_of
 from dro_grasp.objects.shape import ObjectModel
 
 CLEAR = 0.006  # Completed points nearer to what was seen of other things are left out [m] (ours)

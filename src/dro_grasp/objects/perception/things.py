@@ -15,6 +15,7 @@ UNTOLD = 0.01  # Largest share of scattered points that is not worth a word (our
 LIKELY = 0.5  # Extent up to which a cloud is taken for an object without asking [m] (ours)
 AS_SCENE = ("give it as a scene, of which one thing is meant (scene=FILE camera=JSON, and nearest=True, at=(X, Y, Z) or "
             "pixel=(U, V); load_scene and object_at in Python)")  # What to do with a scene
+AS_IMAGE = f". If it is a depth image, {AS_SCENE}; the camera's file states the intrinsics"  # What to do with an image
 
 
 def one_thing(
@@ -30,7 +31,7 @@ def one_thing(
     every = np.arange(len(points))
     things = separate_groups(points) if len(points) else []
     if len(things) > 1:
-        told = "; ".join(f"{_cm(points[own])} cm about {_m(points[own])} m" for own in things[:MOST_TOLD])
+        told = "; ".join(f"{size_of(points[own])} about {place_of(points[own])} m" for own in things[:MOST_TOLD])
         said = f"{len(things)} things that stand apart ({told}{'; ...' if len(things) > MOST_TOLD else ''})"
         if on_table:
             raise ObjectError(
@@ -59,9 +60,11 @@ def refuse_scene(points: Float[np.ndarray, "n 3"], kept: Float[np.ndarray, "m 3"
                       "keep_table=True")
 
 
-def _cm(points: Float[np.ndarray, "n 3"]) -> str:
-    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0))
+def size_of(points: Float[np.ndarray, "n 3"]) -> str:
+    """The extents of points in words."""
+    return " x ".join(f"{100 * extent:.0f}" for extent in np.ptp(points, axis=0)) + " cm"
 
 
-def _m(points: Float[np.ndarray, "n 3"]) -> str:
+def place_of(points: Float[np.ndarray, "n 3"]) -> str:
+    """The middle of points in words [m]."""
     return " ".join(f"{value + 0.0:.2f}" for value in (points.min(0) + points.max(0)) / 2)
