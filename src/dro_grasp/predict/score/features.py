@@ -3,7 +3,7 @@
 Differs from the paper, which ranks by the grasp energy alone: the energy knows nothing of the closing motion, and most
 predicted grasps fail because fingers that arrive one after the other push the object away.
 
-A new feature is one entry of LINK_FEATURES or GRASP_FEATURES; then train the network again (scripts/train_ranking.py).
+A new feature is one entry of LINK_FEATURES or GRASP_FEATURES; then train the network again (lab/recipe/ranking.py).
 """
 
 from __future__ import annotations
