@@ -20,10 +20,12 @@ from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import object_of, object_source, with_sources
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.training.data.collections.collection import count_collection, read_collection
 from dro_grasp.training.data.collections.merging import ANGLE_STEP, POSITION_STEP, Merged, compact, file_name, merge, spread
 from dro_grasp.training.data.engine.shards import Shard, Yield, notes_of
+from dro_grasp.training.made_hands.making import make_hand
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 
@@ -98,6 +100,17 @@ def test_large_sets_become_several_files_that_hold_the_same(folders, hand, tmp_p
     for name, grasps in grasps_in(whole).by_object():
         torch.testing.assert_close(pairs[name].grasps.joints, grasps.joints)
         assert pairs[name].made == whole.yields[name]
+
+
+def test_a_hand_in_a_file_is_found_although_its_first_object_has_no_grasp(hand, tmp_path):
+    file = tmp_path / "claw.urdf"
+    file.write_text(make_hand(3).urdf)
+    own = load_hand(file)
+    for name, batch in (("can", tried(own, "can", 3, seed=0)[[]]), ("sphere", tried(own, "sphere", 4, seed=1))):
+        Shard(own.name, name, 0).save(with_sources(batch, str(file), name, 1.0).to_bytes(notes_of(Yield())), tmp_path / "set")
+    (merged,) = merge([tmp_path / "set"], per_pair=3)
+    assert grasps_in(merged).object == ("sphere",) * 3
+    assert set(merged.yields) == {"can", "sphere"}
 
 
 def test_nothing_to_merge_is_told(hand, tmp_path, capsys):

@@ -129,10 +129,12 @@ def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None
         grasps = GraspBatch.concatenate([GraspBatch.load(waiting.file) for waiting in group])
         for waiting in group:
             waiting.file.unlink()
-        hand = hand or hand_of(grasps, None)
-        new = grasps[distinct(hand, grasps)] if len(group) > 1 else grasps
-        chosen = new if per_pair is None else new[spread(hand, new, per_pair)]
-        columns, header = encode(compact(hand, chosen))
+        new = chosen = grasps
+        if len(grasps):  # without one, the hand's file is not known yet
+            hand = hand or hand_of(grasps, None)
+            new = grasps[distinct(hand, grasps)] if len(group) > 1 else grasps
+            chosen = compact(hand, new if per_pair is None else new[spread(hand, new, per_pair)])
+        columns, header = encode(chosen)
         kept.append(pa.table(columns))
         yields[obj] = sum((waiting.made for waiting in group), Yield())
         duplicates, surplus = duplicates + len(grasps) - len(new), surplus + len(new) - len(chosen)
