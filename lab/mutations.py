@@ -40,6 +40,8 @@ LONGEST = 3600.0
 """Time after which tests are given up [s] (ours)."""
 GOLDEN = "tests/golden/"
 """Tests that compare results bitwise with recorded ones: they find that something changed, not that it is wrong."""
+PLANTED = "DRO_GRASP_PLANTED"
+"""Variable of tests that run in a copy with a fault."""
 STAGES = ("mirrored", "importing", "others", "golden")
 """Groups of test files, in the order in which they run."""
 
@@ -90,7 +92,7 @@ FAULTS = (
     Fault("objects/perception/partial_views.py", "camera.noise * (hits.depth / 0.5) ** 2", "camera.noise * (hits.depth / 0.5)",
           "noise of a depth camera grows with depth, not with its square"),
     Fault("network/checkpoints.py", "if digest != shipped:", 'if shipped == "none":', "hash of shipped weights unchecked"),
-    Fault("network/latent.py", "middle = z + 0.5 * step *", "middle = z + step *", "midpoint rule of the flow without its 0.5"),
+    Fault("network/latent.py", "middle = z + 0.5 * length *", "middle = z + length *", "midpoint rule of the flow without its 0.5"),
     Fault("network/network.py", "query @ key.mT / query.shape[-1] ** 0.5", "query @ key.mT / x.shape[-1] ** 0.5",
           "attention in training scaled by the whole width instead of a head's"),
     Fault("distance_matrix.py", "better = error_read < error_given", "better = error_read > error_given",
@@ -113,7 +115,7 @@ FAULTS = (
           "perturbed servos change their gain without their feedback"),
     Fault("simulation/outcome.py", "counted = slice(None) if rules.reset else slice(-1, None)", "counted = slice(-1, None)",
           "a protocol with a reset judges the last force alone"),
-    Fault("predict/settling.py", "replace(known, stable=stable & ~wrong)", "known",
+    Fault("predict/settling.py", "stable = settled.stable & ~wrong", "stable = settled.stable",
           "a grasp that ends where constraints forbid keeps its score"),
     Fault("predict/admission.py", "(enough & ~(beside & (distance < config.touch)).any(-1)).cpu()", "enough.cpu()",
           "touch beside the contact region ignored"),
@@ -126,8 +128,8 @@ FAULTS = (
     Fault("compare/rows.py", "{label: success_rate(k, asked) for label, k in numbers.items()}",
           "{label: success_rate(k, len(success[0])) for label, k in numbers.items()}",
           "rates of what was returned rather than of what was asked for"),
-    Fault("training/runs.py", "(self.schedule.seed * 1_000_003 + self.step) * 1_009 + shard",
-          "(self.schedule.seed * 1_000_003 + self.step) * 1_009", "all shards of a step draw the same samples"),
+    Fault("training/runs.py", "(self.schedule.seed * 1_000_003 + step) * 1_009 + shard",
+          "(self.schedule.seed * 1_000_003 + step) * 1_009", "all shards of a step draw the same samples"),
     Fault("training/data/engine/schedule.py", "[shard[0] - 1 :: shard[1]]", "[shard[0] :: shard[1]]",
           "the first pair of a data set that several machines make belongs to none"),
 )
@@ -162,7 +164,8 @@ def run_tests(folder: Path, tests: Sequence[str], *options: str) -> tuple[str, .
     report.unlink(missing_ok=True)
     words = [sys.executable, "-m", "pytest", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-o",
              "junit_family=xunit1", "--junitxml", str(report), "--basetemp", str(folder.parent / "temporary"), *options, *tests]
-    here = {"PYTHONPATH": str(folder / "src"), "DRO_GRASP_CACHE": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1"}
+    here = {"PYTHONPATH": str(folder / "src"), "DRO_GRASP_CACHE": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1",
+            PLANTED: "1"}
     try:
         done = subprocess.run(words, cwd=folder, env=os.environ | here, capture_output=True, text=True, timeout=LONGEST,
                               check=False)

@@ -1,15 +1,13 @@
-"""Planted faults: where each goes, which tests are near it, and what is read from a report of pytest.
-
-Whether the table of faults fits the code is the script's to say: here, each planted fault would be found by that.
-"""
+"""Planted faults: where each goes, which tests are near it, and what is read from a report of pytest."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
-from lab.mutations import FAULTS, Fault, failures, near
+from lab.mutations import FAULTS, PLANTED, ROOT, Fault, failures, near
 
 REPORT = """<testsuites><testsuite>
 <testcase name="test_good" file="tests/a/test_b.py"/>
@@ -41,6 +39,12 @@ def test_tests_near_a_fault_are_those_of_its_folder_and_those_that_import_it() -
 def test_failures_and_modules_that_are_not_imported_are_read_from_a_report(tmp_path: Path) -> None:
     (tmp_path / "report.xml").write_text(REPORT)
     assert list(failures(tmp_path / "report.xml")) == ["tests/a/test_b.py::test_bad[1-x]", "tests/a/test_c.py"]
+
+
+@pytest.mark.skipif(PLANTED in os.environ, reason="each planted fault would be found by this")
+def test_the_faults_fit_the_code() -> None:
+    for fault in FAULTS:
+        assert (ROOT / "src" / "dro_grasp" / fault.path).read_text().count(fault.text) == 1, fault.breaks
 
 
 def test_there_are_thirty_faults_over_the_core_of_the_package() -> None:
