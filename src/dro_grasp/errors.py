@@ -30,7 +30,7 @@ class ObjectError(DroGraspError):
 class UngraspableError(ObjectError):
     """What was given is no thing for a hand to grasp, and may still be in its way: an image, a sheet, of another size."""
 
-    def __init__(self, fault: str, advice: str) -> None:
+    def __init__(self, fault: str, advice: str = "") -> None:
         super().__init__(f"{fault}{advice}")
         self.fault = fault
         """What is wrong, without what to do for grasping it."""

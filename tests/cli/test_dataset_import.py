@@ -65,3 +65,10 @@ def test_an_output_that_is_a_file_is_refused_before_the_work(
     assert imported("missing.pt", "--output", str(tmp_path / "out")) == 2
     assert f"{tmp_path / 'out'} is a file; give a folder" in capsys.readouterr().err
     assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_two_hands_without_names_in_the_file_are_refused(
+    theirs: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert imported(theirs, "--hands", "barrett", "gripper3", "--output", str(tmp_path / "out")) == 2
+    assert "--hands names barrett and gripper3 for all hands of the files" in capsys.readouterr().err

@@ -57,6 +57,15 @@ def test_export_takes_a_folder(folder: Path, tmp_path: Path) -> None:
     assert rows == {"sphere.csv": 3, "can.csv": 2}
 
 
+def test_objects_whose_names_look_alike_as_files_keep_a_file_each(folder: Path, tmp_path: Path) -> None:
+    grasps = load_grasps(folder / "sphere.parquet")
+    grasps = grasps.replace(pregrasp_joints=grasps.joints, squeeze_joints=grasps.joints)
+    alike = GraspBatch.concatenate([grasps.replace(object=(name,) * 3, object_sha256=(name,) * 3) for name in ("a/b", "a-b")])
+    alike.save(tmp_path / "alike.parquet")
+    assert main(["export", str(tmp_path / "alike.parquet"), "--format", "csv", "--output", str(tmp_path / "out")]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a-b-2.csv", "a-b.csv"]
+
+
 @pytest.mark.parametrize(("more", "tiles"), [([], (4, 2)), (["--count", "2"], (2, 1)), (["--object", "can"], (2, 1))])
 def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], tiles: tuple[int, int]) -> None:
     path = tmp_path / "sheet.png"

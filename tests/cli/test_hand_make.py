@@ -49,3 +49,18 @@ def test_existing_files_are_refused_before_the_work(tmp_path: Path, capsys: pyte
 def test_impossible_numbers_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, value: str) -> None:
     assert make(tmp_path, option, value) == 2
     assert f"error: {option} is {value}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("listing", ["a,b\n1,2\n", "name,more\nhand_00001,x\n"])
+def test_a_foreign_listing_is_refused_and_an_older_one_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], listing: str
+) -> None:
+    (tmp_path / "hands.csv").write_text(listing)
+    code = make(tmp_path, "--num", "1")
+    if "name" in listing:
+        assert code == 0
+        assert (tmp_path / "hands.csv").read_text().splitlines()[2].startswith("hand_00001,")
+        return
+    assert code == 2
+    assert "hands.csv cannot be read" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["hands.csv"], "before the work"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pickle
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.cli.robots import Plan, Tabletop
 from dro_grasp.cli.switches import in_switches, use_options_of
 from dro_grasp.cli.view import View
+from dro_grasp.errors import UngraspableError
 from dro_grasp.objects.perception.things import AS_SCENE
 from dro_grasp.simulation.scene import require_simulable
 
@@ -172,3 +174,8 @@ def test_what_is_no_obstacle_is_referred_to_surroundings(tmp_path: Path) -> None
             load_obstacle(name)
         assert "--surroundings" not in str(caught.value)
     assert load_obstacle("can").name == "can"
+
+
+def test_what_is_no_thing_to_grasp_passes_between_processes() -> None:
+    error = pickle.loads(pickle.dumps(UngraspableError("it measures 3 m, too large", " for a hand")))
+    assert (str(error), error.fault) == ("it measures 3 m, too large for a hand", "it measures 3 m, too large")

@@ -302,3 +302,8 @@ def test_methods_of_before_are_taken_and_told() -> None:
     assert torch.equal(before.joints, batch.joints)
     with pytest.warns(FutureWarning, match="moved_to is called with_poses now"):
         assert torch.equal(batch.moved_to(batch.T_object_wrist, batch.joints + 1).joints, batch.joints + 1)
+
+
+def test_a_further_column_of_three_axes_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"more than two axes: {'mine': \(2, 2, 3\)}"):
+        make(2).replace(extra={"mine": torch.zeros(2, 2, 3)})

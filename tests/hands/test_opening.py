@@ -179,11 +179,12 @@ def test_a_stated_posture_that_is_no_number_is_refused(tmp_path: Path) -> None:
         dro.load_hand(path)
 
 
-def test_a_keyframe_of_an_mjcf_may_state_the_open_posture(tmp_path: Path) -> None:
-    """Its values follow the joints, and begin with the seven of the free base."""
+@pytest.mark.parametrize("mass", ["", 'mass="0"'])
+def test_a_keyframe_of_an_mjcf_may_state_the_open_posture(tmp_path: Path, mass: str) -> None:
+    """Its values follow the joints, and begin with the seven of the free base; links may be without a mass, as elsewhere."""
     finger = """<body name="{name}" pos="{x} 0 0.01"><joint name="{name}" axis="0 {side} 0" range="-180 86"/>
-      <geom type="box" size="0.006 0.006 0.03" pos="0 0 0.03"/></body>"""
-    fingers = finger.format(name="a", x=-0.035, side=1) + finger.format(name="b", x=0.035, side=-1)
+      <geom type="box" size="0.006 0.006 0.03" pos="0 0 0.03" {mass}/></body>"""
+    fingers = finger.format(name="a", x=-0.035, side=1, mass=mass) + finger.format(name="b", x=0.035, side=-1, mass=mass)
     key = '<keyframe><key name="{name}" qpos="0 0 0 1 0 0 0 -1.1 -1.2"/></keyframe>'
     text = """<mujoco><compiler autolimits="true"/><worldbody><body name="palm"><freejoint/>
       <geom type="box" size="0.04 0.04 0.01"/>{fingers}</body></worldbody>{key}</mujoco>"""

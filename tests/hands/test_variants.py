@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
@@ -132,3 +133,18 @@ def test_what_cannot_be_varied_is_refused(tmp_path: Path, capsys: pytest.Capture
         dro.vary_hand(mjcf, mirrored=True)
     assert main(["hand", "vary", "leaphand", "--output", str(tmp_path / "same.urdf")]) == 2
     assert "--mirrored" in capsys.readouterr().err
+
+
+def test_meshes_beside_what_a_link_leads_to_are_found(tmp_path: Path) -> None:
+    (tmp_path / "a" / "meshes").mkdir(parents=True)
+    (tmp_path / "b").mkdir()
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(tmp_path / "a" / "meshes" / "x.stl")
+    root = ET.fromstring((Path(dro.__file__).parent / "hands" / "builtin" / "gripper3.urdf").read_text())
+    for geometry in root.iter("geometry"):
+        for shape in list(geometry):
+            geometry.remove(shape)
+        ET.SubElement(geometry, "mesh", filename="meshes/x.stl")
+    ET.ElementTree(root).write(tmp_path / "a" / "h.urdf")
+    (tmp_path / "b" / "h.urdf").symlink_to(tmp_path / "a" / "h.urdf")
+    made = ET.fromstring(dro.vary_hand(str(tmp_path / "b" / "h.urdf"), factor=1.2))
+    assert {mesh.get("filename") for mesh in made.iter("mesh")} == {str(tmp_path / "a" / "meshes" / "x.stl")}

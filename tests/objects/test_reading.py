@@ -380,3 +380,19 @@ def test_what_is_no_object_is_refused_in_words(source, word: str) -> None:
 def test_other_types_are_refused_in_words(given: Any, told: str) -> None:
     with pytest.raises(DroGraspError, match=told):
         load_object(given)
+
+
+def test_the_scale_that_is_advised_counts_from_a_stated_unit(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box((2000, 2000, 2000))
+    mesh.units = "mm"
+    with pytest.raises(ObjectError, match=r"measures 2 m, .* scale=0.01 for centimetres, which makes it 2 cm"):
+        load_object(mesh)
+    assert load_object(mesh, scale=0.01).extents == pytest.approx((0.02, 0.02, 0.02))
+    assert mesh.extents == pytest.approx((2000, 2000, 2000)), "what was given stays as it is"
+
+
+def test_a_wrong_vertex_is_named(tmp_path: Path) -> None:
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    for wrong in (-1, 3):
+        with pytest.raises(ObjectError, match=rf"a face with vertex {wrong}, and vertices 0 to 2"):
+            load_object((corners, np.array([[0, 1, wrong]])))

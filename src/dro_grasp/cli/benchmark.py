@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("carry", "strict")}
 """What --quick measures: of 16 candidates a pair, methods return a quarter (ours)."""
+QUICK_OBJECTS = 2  # Objects that --quick takes (ours)
 
 
 @dataclass(frozen=True)
@@ -74,16 +75,19 @@ class Benchmark:
 
     def run(self) -> int:
         """Load everything, measure, print."""
+        if self.quick:
+            return dataclasses.replace(self, quick=False, **QUICK)._measure(QUICK_OBJECTS)
+        return self._measure(None)
+
+    def _measure(self, most: int | None) -> int:
+        """All of it, with at most so many objects."""
         from dro_grasp.compare.stages import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.errors import ObjectError, OptionError
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predict.config import GraspRequest
         from dro_grasp.predict.constraints import Constraints
         from dro_grasp.simulation.protocols import protocol
 
-        if self.quick:
-            return dataclasses.replace(self, quick=False, **QUICK, objects=tuple(resolve_objects(list(self.objects))[:2])).run()
         GraspRequest(self.num, candidates=self.candidates, temperature=self.temperature, least_confidence=self.least_confidence)
         if self.views < 1:
             raise OptionError(f"--views is {self.views}; give at least 1")
@@ -93,7 +97,7 @@ class Benchmark:
         begin = time.perf_counter()
         methods = self._methods()
         hands = [load_hand(name) for name in self.hands]
-        objects = self._objects()
+        objects = self._objects(most)
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
             raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be simulated; give meshes")
         further = {REFINED: (BEST, *TOP), SETTLED: (SETTLED_BEST,)}
@@ -135,13 +139,14 @@ class Benchmark:
             title += f", view '{self.view}'"
         return title + (f", {self.views} views" if self.views > 1 else "")
 
-    def _objects(self) -> list[ObjectModel]:
-        """The objects, loaded."""
+    def _objects(self, most: int | None) -> list[ObjectModel]:
+        """The objects, or the first of them, loaded."""
         from dro_grasp.objects.catalogue import SCALES, load_object, processed_objects, resolve_objects
 
         if self.dexgraspbench is None:
-            return [load_object(name) for name in resolve_objects(list(self.objects))]
-        return [load_object(folder, scale=scale) for folder in processed_objects(self.dexgraspbench) for scale in SCALES]
+            return [load_object(name) for name in resolve_objects(list(self.objects))[:most]]
+        scaled = [(folder, scale) for folder in processed_objects(self.dexgraspbench) for scale in SCALES]
+        return [load_object(folder, scale=scale) for folder, scale in scaled[:most]]
 
     def _methods(self) -> list[Method]:
         """The methods that were named, or the network and its controls."""

@@ -135,12 +135,15 @@ class Import:
 
     def run(self) -> int:
         """Read all files, find hands and objects, write grasp files."""
-        from dro_grasp.errors import GraspFileError
+        from dro_grasp.errors import GraspFileError, OptionError
         from dro_grasp.files import check_folder, make_folder
         from dro_grasp.training.data.collections.importing import import_grasps
         from dro_grasp.training.data.collections.merging import file_name
 
         check_folder(self.output)
+        if len(plain := [name for name in self.hands if "=" not in name]) > 1:
+            raise OptionError(f"--hands names {' and '.join(plain)} for all hands of the files; name one, or say which is "
+                              "which (NAME_IN_FILE=NAME)")
         here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
         by_hand, missing = import_grasps(self.inputs, self.format, here, self.object)
         for obj, why in missing.items():

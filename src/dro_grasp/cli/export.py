@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,10 +56,13 @@ class Export:
         jobs = {name: self._job(batch, frame) for name, batch in batches.items()}
         if folder:
             make_folder(target)
-        written: list[Path] = []
+        written, labels = list[Path](), set[str]()
         for name, job in jobs.items():
-            label = name.replace("/", "-") + ("" if form.file_per_grasp else form.suffix)
-            written += write(form.content(job), target / label if len(jobs) > 1 else target, form.suffix)
+            plain = name.replace("/", "-")
+            label = next(each for each in (plain, *(f"{plain}-{k}" for k in count(2))) if each not in labels)
+            labels.add(label)
+            place = target / (label if form.file_per_grasp else f"{label}{form.suffix}")
+            written += write(form.content(job), place if len(jobs) > 1 else target, form.suffix)
         if self.json:
             print_json({"format": self.format, "frame": frame.name, "num": len(grasps), "files": [str(p) for p in written]})
         else:

@@ -6,7 +6,7 @@ import csv
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -57,7 +57,7 @@ class Make:
         if there and not self.overwrite:
             raise OutputError(f"{len(there)} of {len(files)} files exist (first: {there[0]}); give --overwrite to replace "
                               "them, or another --seed or folder")
-        made = []
+        listing, made = _listing(folder / LISTING), []
         with progress_bar("making hands", self.json) as progress:
             for seed, file in zip(seeds, files, strict=True):
                 made.append(make_hand(seed))
@@ -65,7 +65,11 @@ class Make:
                     temporary.write_text(made[-1].urdf)
                 if progress is not None:
                     progress(len(made), self.num)
-        _add_to_listing(folder / LISTING, made)
+        listing |= {hand.name: hand.facts() for hand in made}
+        with replacing(folder / LISTING) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(made[0].facts()), extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(listing[name] for name in sorted(listing))
         if self.picture is not None:
             _draw(files, made, self.picture)
         self._report(made)
@@ -85,19 +89,16 @@ class Make:
             say(f"picture: {self.picture}")
 
 
-def _add_to_listing(path: Path, made: list[MadeHand]) -> None:
-    """Write the rows of these hands, beside those of other hands in the folder."""
-    from dro_grasp.files import replacing
+def _listing(path: Path) -> dict[str, dict[str, Any]]:
+    """Rows of the hands that a folder's listing has, by name; nothing where there is no listing."""
+    from dro_grasp.errors import OutputError
+    from dro_grasp.files import reading
 
-    rows = {}
-    if path.exists():
-        with path.open(newline="") as file:
-            rows = {row["name"]: row for row in csv.DictReader(file)}
-    rows |= {hand.name: hand.facts() for hand in made}
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(made[0].facts()))
-        writer.writeheader()
-        writer.writerows(rows[name] for name in sorted(rows))
+    if not path.exists():
+        return {}
+    with reading(path, OutputError, "the listing of a folder of made hands; name another folder", KeyError), \
+            path.open(newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
 
 
 def _draw(files: list[Path], made: list[MadeHand], path: Path) -> None:

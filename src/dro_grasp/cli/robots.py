@@ -249,7 +249,7 @@ class Tabletop:
     """
 
     robot: str  # A robot file, or the name of a built-in robot (see `dro-grasp robot list`).
-    objects: tuple[str, ...]  # Names or files of meshes, `all`, or `assets:validate`.
+    objects: tuple[str, ...]  # Names or files of meshes, or groups such as builtin:test.
     attempts: int = 10  # Attempts with each object, each at another place and in another pose.
     see: Literal["cloud", "mesh"] = "cloud"
     """What the planner is given: the cloud of the robot's camera, or, as a control, the true mesh at its true place."""

@@ -63,6 +63,8 @@ def require_fit(batch: Any, n_names: int) -> None:
         raise ValueError(f"{batch.joints.shape[1]} values for {n_names} joint names")
     if taken_names := sorted(batch.extra.keys() & {*COLUMNS, "success"}):
         raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
+    if deep := {name: tuple(v.shape) for name, v in batch.extra.items() if isinstance(v, Tensor) and v.ndim > 2}:
+        raise ValueError(f"further columns have more than two axes: {deep}; give (n) or (n k), or a column for each part")
     if bool((batch.trial_success & ~batch.evaluated).any()):
         raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.files import command
 from dro_grasp.hands.description.loader import part_of_urdf
-from dro_grasp.hands.description.urdf import MOVING, find_mesh
+from dro_grasp.hands.description.urdf import MOVING, mesh_of
 from dro_grasp.hands.description.xml_files import parse_xml
 from dro_grasp.hands.library import locate_hand
 from dro_grasp.kinds import checked
@@ -46,7 +46,7 @@ def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) 
     if link is not None:
         part_of_urdf(root, link, path)
     for mesh in root.iter("mesh"):
-        file = find_mesh(mesh.get("filename", ""), path.parent)
+        file = mesh_of(mesh.get("filename", ""), path)
         if file is not None:
             mesh.set("filename", str(file))
     try:

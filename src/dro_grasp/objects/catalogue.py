@@ -164,7 +164,7 @@ def _load_asset(entry: dict[str, Any], scale: float) -> ObjectModel:
 def _read_mesh(path: Path) -> trimesh.Trimesh:
     if not path.is_file():
         raise ObjectError(f"the assets' manifest names {path}, which does not exist; repair the assets folder")
-    mesh = read_geometry(path)[0]
+    mesh = read_geometry(path)
     if isinstance(mesh, np.ndarray):
         raise ObjectError(f"{path} has no faces; prepare the object, or the assets folder, again")
     return mesh

@@ -45,23 +45,19 @@ def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> Ob
     if not path.is_file():
         raise ObjectError(f"no object file at {path}; give an existing mesh or point cloud, or a name that "
                           "`dro-grasp objects` lists")
-    geometry, unit = read_geometry(path)
+    geometry = read_geometry(path)
     if isinstance(geometry, np.ndarray):
-        if unit != 1.0:
-            geometry[:, :3] *= unit
         return cloud_object(path.stem, geometry, origin=str(path), scale=scale, keep_table=keep_table,
                             named_normals=path.suffix.lower() != ".npy")
-    if unit != 1.0:
-        geometry.apply_scale(unit)
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
 
 
 def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
     """An object from a trimesh mesh, cloud or scene, from (vertices, faces), or from points (n 3) or with normals (n 6)."""
-    geometry, unit = geometry_in_memory(source)
+    geometry = geometry_in_memory(source)
     if isinstance(geometry, trimesh.Trimesh):
-        return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale * unit)
-    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale * unit, keep_table=keep_table)
+        return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale)
+    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale, keep_table=keep_table)
 
 
 def mesh_object(
@@ -227,8 +223,9 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
         raise ObjectError(f"{origin} has {len(vertices)} vertices and no faces; give a triangle mesh, or a point cloud "
                           "as PLY, NPY or PCD")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ObjectError(f"{origin} has a face with vertex {faces.max()}, and only {len(vertices)} vertices; the file "
-                          "is damaged, export it again")
+        wrong = faces.min() if faces.min() < 0 else faces.max()
+        raise ObjectError(f"{origin} has a face with vertex {wrong}, and vertices 0 to {len(vertices) - 1}; the file is "
+                          "damaged, export it again")
     bad = int((~np.isfinite(vertices)).any(1).sum())
     if bad:
         raise ObjectError(f"{origin} has {bad} vertices with NaN or infinite coordinates; repair the mesh first")

@@ -28,22 +28,17 @@ NARROWEST = 32  # Width from which an array (h, w) is an image, and no list of p
 CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 
 
-def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
-    return read_rows(path)[:, :3]
-
-
 def read_rows(path: Path) -> Float[np.ndarray, "n columns"]:
-    """The same, with the normals that the file has of them in three more columns."""
+    """Points of a cloud file, NaN and outliers included, and its normals in three more columns [metres, or the file's unit]."""
     if not path.is_file():
         raise ObjectError(f"no file at {path}; with camera=... give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
-    geometry, unit = read_geometry(path)
+    geometry = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
         raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out camera=..., or give a cloud (PLY, NPY, PCD)")
     refuse_image(geometry, str(path))
     rows = in_rows(geometry)
-    points = coordinates(rows, str(path)) * unit
+    points = coordinates(rows, str(path))
     return np.column_stack([points, rows[:, 3:]]) if rows.shape[1] == 6 else points
 
 
@@ -86,23 +81,21 @@ def returned(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     return finite & ~zero
 
 
-def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
-    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
+def read_geometry(path: Path) -> trimesh.Trimesh | Float[np.ndarray, "..."]:
+    """One mesh, scenes merged, or the points of a file without faces; in metres where the file states its unit."""
     if path.suffix.lower() in IMAGES:
         raise UngraspableError(f"{path} is an image, and no mesh or cloud", AS_IMAGE)
     if path.suffix.lower() in CLOUD_SUFFIXES:
-        return read_cloud(path), 1.0
+        return read_cloud(path)
     # trimesh alone is called here, and its many readers raise whatever they stumble over.
     with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD", Exception):
-        loaded = open_mesh(path, process=False)
-        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
-        geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
+        geometry = in_metres(open_mesh(path, process=False))
         if isinstance(geometry, trimesh.PointCloud):
-            return _with_normals(geometry), unit
+            return _with_normals(geometry)
     if not isinstance(geometry, trimesh.Trimesh):
         raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
                           "point cloud as PLY, NPY or PCD")
-    return geometry, unit
+    return geometry
 
 
 def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
@@ -115,6 +108,13 @@ def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
     return np.column_stack([points, *(np.asarray(raw[name], np.float64).reshape(len(points)) for name in names)])
 
 
+def in_metres(given: Any) -> Any:
+    """One mesh or cloud, scenes merged, in metres where a unit is stated; what was given stays as it is."""
+    unit = trimesh.units.unit_conversion(given.units, "meters") if given.units else 1.0
+    geometry = merge_scene(given) if isinstance(given, trimesh.Scene) else given
+    return geometry if unit == 1.0 else geometry.copy().apply_scale(unit)
+
+
 def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
     """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
     mesh = scene.to_mesh()
@@ -122,12 +122,11 @@ def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
     return trimesh.PointCloud(np.concatenate(clouds)) if clouds and len(mesh.faces) == 0 else mesh
 
 
-def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
-    """One mesh, scenes merged, or points; and their unit [m], 1 where none is stated. Other things are an ObjectError."""
+def geometry_in_memory(source: Any) -> trimesh.Trimesh | Float[np.ndarray, "..."]:
+    """One mesh, scenes merged, or points, in metres where a unit is stated. Other things are an ObjectError."""
     if isinstance(source, trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene):
-        unit = trimesh.units.unit_conversion(source.units, "meters") if source.units else 1.0
-        geometry = merge_scene(source) if isinstance(source, trimesh.Scene) else source
-        return (np.asarray(geometry.vertices, np.float64) if isinstance(geometry, trimesh.PointCloud) else geometry), unit
+        geometry = in_metres(source)
+        return np.asarray(geometry.vertices, np.float64) if isinstance(geometry, trimesh.PointCloud) else geometry
     if isinstance(source, tuple) and len(source) == 2:
         vertices, faces = numbers(source[0]), numbers(source[1])
         for what, array in (("vertices", vertices), ("faces", faces)):
@@ -135,9 +134,9 @@ def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray,
                 raise ObjectError(f"the {what} have shape {array.shape}; expected (n, 3)")
         if faces.dtype.kind not in "iu":
             raise ObjectError(f"the faces are numbers of type {faces.dtype}; give the indices of their vertices as integers")
-        return trimesh.Trimesh(vertices, faces, process=False), 1.0
+        return trimesh.Trimesh(vertices, faces, process=False)
     if isinstance(source, np.ndarray | Tensor):
-        return numbers(source).astype(np.float64), 1.0
+        return numbers(source).astype(np.float64)
     raise ObjectError(f"an object cannot be loaded from a {type(source).__name__}; give a name, the path of a mesh or cloud, a "
                       "trimesh mesh, a pair (vertices, faces), or an array of points (n, 3)")
 

@@ -31,7 +31,7 @@ from dro_grasp.objects.perception.scene_files import (
 )
 from dro_grasp.objects.perception.segmentation import Segments, segment
 from dro_grasp.objects.perception.taking import taken_object
-from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
+from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, numbers, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
@@ -232,17 +232,17 @@ def load_scene(
         label, origin = name or path.stem, str(path)
         if is_depth(path):
             return _seen(label, sight_of_depth(read_depth(path, seen_by), seen_by, scale, origin))
-        geometry, unit = read_geometry(path)
+        geometry = read_geometry(path)
     else:
-        (geometry, unit), label, origin = geometry_in_memory(source), name or "scene", "the given scene"
+        geometry, label, origin = geometry_in_memory(source), name or "scene", "the given scene"
         if isinstance(geometry, np.ndarray) and is_depth(geometry):
-            return _seen(label, sight_of_depth(np.asarray(source), seen_by, scale, origin))
+            return _seen(label, sight_of_depth(numbers(source), seen_by, scale, origin))
     if isinstance(geometry, trimesh.Trimesh):
         if seen_by is not None:
             raise ObjectError(f"{origin} is a mesh, and no camera sees one; give its cloud or depth image, or leave out the "
                               "camera")
-        return _scaled(_of_mesh(label, geometry, origin, scale * unit), scale, origin)
-    seen = _seen(label, sight_of_cloud(coordinates(geometry, origin) * (scale * unit), seen_by, _shape(geometry)), origin)
+        return _scaled(_of_mesh(label, geometry, origin, scale), scale, origin)
+    seen = _seen(label, sight_of_cloud(coordinates(geometry, origin) * scale, seen_by, _shape(geometry)), origin)
     return _scaled(seen, scale, origin)
 
 

@@ -91,3 +91,10 @@ def test_what_cannot_be_sent_is_named(
     with pytest.raises(OptionError, match=told):
         client.predict("gripper3", obj, **options)
     assert not sent
+
+
+@pytest.mark.parametrize(("choose", "told"), [
+    ({"mask": "nowhere.png"}, "mask: no file at nowhere.png"), ([(0, 0, 0)], "give a dict of at, pixel, nearest or mask")])
+def test_a_choice_that_cannot_be_sent_is_refused(choose: Any, told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        dro.GraspClient("http://127.0.0.1:9").predict("allegro", CLOUD, choose=choose)

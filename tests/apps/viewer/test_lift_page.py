@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
+from dro_grasp.apps.viewer.clear_page import clear_page
 from dro_grasp.apps.viewer.film import Film
 from dro_grasp.apps.viewer.lift_page import EVERY, LiftPage, lift_page
+from dro_grasp.arm.clearing.record import ClearRecorder
 from dro_grasp.arm.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.robot_check import robot_shapes, shape_poses
 from dro_grasp.arm.tabletop.animation import Recorder
@@ -18,6 +20,7 @@ from dro_grasp.arm.tabletop.attempts import Attempt, write_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
+from dro_grasp.errors import OptionError
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
@@ -70,7 +73,7 @@ def test_played_lifts_say_what_the_joints_say_of_the_hand(robot: dro.Robot, plan
     hold = {"held_joints": squeezed, "held_torque": np.zeros(n), "empty_joints": empty, "empty_torque": np.zeros(n),
             "hold_unit": np.ones(n)}
     told = replace(plan, notes=replace(plan.notes, hold={name: tuple(row.tolist()) for name, row in hold.items()}))
-    recorder = Recorder(10.0, plan=told)
+    recorder = Recorder(10.0, plans=[(0, told)])
     for joints in (squeezed, empty):
         recorder.frames += [(robot.home, joints, np.eye(4)[None])] * 15  # of 2 s, of which the last 0.4 s are the lift
     film = Film.of_attempt(recorder)
@@ -148,3 +151,32 @@ def test_an_attempt_that_cannot_be_repeated_is_told(
             Film.of_attempt(Recorder())
     finally:
         page.stop()
+
+
+def test_words_of_an_attempt_are_those_of_the_plan_that_is_carried_out(robot: dro.Robot, plan: dro.MotionPlan) -> None:
+    """As where a thing is pushed to the edge first, and then lifted."""
+    n, seconds = len(robot.hand_joints), int(10 * plan.seconds) + 1
+    recorder = Recorder(10.0)
+    for _ in range(2):
+        recorder.plans.append((len(recorder.frames), plan))
+        recorder.frames += [(robot.home, np.zeros(n), np.eye(4)[None])] * seconds
+    film = Film.of_attempt(recorder)
+    assert film.words[:seconds] == film.words[seconds:]
+    assert film.words[seconds].startswith("**reach**")
+
+
+@pytest.mark.parametrize("kind", ["plan", "record"])
+def test_a_robot_with_other_joints_is_refused(
+    robot: dro.Robot, plan: dro.MotionPlan, small_robot: str, tmp_path: Path, kind: str
+) -> None:
+    if kind == "plan":
+        plan.save(tmp_path / "m.npz")
+        with pytest.raises(OptionError, match=r"7 joints in its arm and 6 in its hand, and the plan in .*m.npz 7 and 16"):
+            lift_page(tmp_path / "m.npz", robot=small_robot, port=free_port())
+    else:
+        recorder = ClearRecorder()
+        recorder.looked(np.zeros((1, 3)))
+        recorder.frames.append((robot.home, robot.open_hand, np.zeros((0, 4, 4))))
+        recorder.record(robot).save(tmp_path / "m.npz")
+        with pytest.raises(OptionError, match=r"and the record in .*m.npz"):
+            clear_page(tmp_path / "m.npz", small_robot, port=free_port())

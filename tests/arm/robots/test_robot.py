@@ -177,6 +177,7 @@ SQUASHED = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     (change("home/joint2", None), "home lacks joint 'joint2'"),
     (change("camera/T_world_camera", SQUASHED), "no rigid motion"),
     (change("camera/focal", 0), "camera: focal is 0"),
+    (change("camera/width", 0.5), "camera: width is 0.5; expected a whole number of pixels"),
     (change("mount/quaternion_wxyz", [1, 1, 0, 0]), "has length 1.41421"),
     (change("table/size", [0, 1]), "expected metres above 0"),
 ])

@@ -120,6 +120,14 @@ def test_depth_files_give_the_same_points(name: str, unit: float | None, tmp_pat
     np.testing.assert_allclose(scene.sight.points, true, atol=0.001)  # [m], of rounding
 
 
+def test_a_depth_tensor_is_read_whatever_needs_its_gradient(tmp_path: Path) -> None:
+    made = make_scene("table", 1, 0, width=160)
+    depth = torch.tensor(np.where(made.depth < 5, made.depth, 0.0), requires_grad=True)
+    camera = _saved(made, tmp_path)
+    scenes = [load_scene(each, camera=camera) for each in (depth, depth.detach().numpy())]
+    np.testing.assert_array_equal(*(scene.points_seen() for scene in scenes))
+
+
 def test_depth_without_intrinsics_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", np.ones((48, 64)))
     with pytest.raises(OptionError, match="give its camera with intrinsics"):

@@ -7,6 +7,7 @@ import io
 import json
 import time
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError, URLError
@@ -63,8 +64,10 @@ class GraspClient:
         options = {present(name, FORMER_CONSTRAINTS): value for name, value in options.items()}
         if options.get("obstacles") is not None:
             options["obstacles"] = sent_object(options["obstacles"])
-        if (options.get("choose") or {}).get("mask") is not None:
-            options["choose"] = options["choose"] | {"mask": sent_mask(options["choose"]["mask"])}
+        if not isinstance(choose := options.get("choose") or {}, Mapping):
+            raise OptionError(f"choose is {choose!r}; give a dict of at, pixel, nearest or mask")
+        if choose.get("mask") is not None:
+            options["choose"] = {**choose, "mask": sent_mask(choose["mask"])}
         call = {"hand": hand, "object": sent_object(obj) | of_object, "num": num, "id": uuid.uuid4().hex, **options}
         return self.ask("POST", "/grasps", call)
 
@@ -137,7 +140,9 @@ def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
 def sent_mask(mask: str | Path | ArrayLike) -> dict[str, Any]:
     """A mask as a request holds it: a PNG, not black where it is true or not 0."""
     if isinstance(mask, str | Path):
-        return sent_file("mask.png", given_path(mask).read_bytes())["file"]
+        if not (path := given_path(mask)).is_file():
+            raise OptionError(f"mask: no file at {path}; give the path of a PNG, or an array (h, w)")
+        return sent_file("mask.png", path.read_bytes())["file"]
     import numpy as np
     from PIL import Image
 

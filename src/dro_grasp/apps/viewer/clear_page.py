@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
+from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.clearing.record import ClearRecord, Event, Judgement, Look, Picked
 from dro_grasp.arm.robots.loading import load_robot
@@ -122,7 +122,9 @@ def clear_page(
 ) -> ClearPage:
     """A page for what `dro-grasp clear --record` wrote; the robot is given where the record's own is not meant."""
     record = ClearRecord.load(file)
-    return ClearPage(record, load_robot(robot or record.robot), port, host, token)
+    own = load_robot(robot or record.robot)
+    require_joints(own, record.arm.shape[1], record.hand.shape[1], f"the record in {file}")
+    return ClearPage(record, own, port, host, token)
 
 
 def picks(record: ClearRecord) -> list[tuple[int, Picked]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -75,10 +76,12 @@ class Film:
         if not recorder.frames:
             raise OptionError("the attempt ended before the robot moved; there is nothing to play")
         arm, hand, poses = (np.stack(part) for part in zip(*recorder.frames, strict=True))
-        plan = recorder.plan
-        told = [] if plan is None else [moment_of(plan, i / recorder.rate, joints) for i, joints in enumerate(hand)]
+        plans, told = recorder.plans, []
+        for begin, end in pairwise([*(begin for begin, _ in plans), len(hand)]):
+            plan = dict(plans)[begin]
+            told += [moment_of(plan, (i - begin) / recorder.rate, hand[i]) for i in range(begin, end)]
         words, held = tuple(words for words, _ in told), tuple(held for _, held in told)
-        return Film(arm, hand, poses, plan, recorder.objects, words, held)
+        return Film(arm, hand, poses, plans[-1][1] if plans else None, recorder.objects, words, held)
 
 
 def moment_of(

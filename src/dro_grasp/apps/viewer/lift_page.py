@@ -11,7 +11,7 @@ import torch
 import viser
 
 from dro_grasp.apps.viewer.film import RATE, Film
-from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView
+from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
@@ -190,7 +190,9 @@ def lift_page(
     """
     if file.suffix.lower() == ".npz":
         plan = MotionPlan.load(file)
-        page = LiftPage(load_robot(robot or plan.notes.robot), (), weights, port, host, token=token)
+        own = load_robot(robot or plan.notes.robot)
+        require_joints(own, len(plan.notes.arm_joints), len(plan.notes.hand_joints), f"the plan in {file}")
+        page = LiftPage(own, (), weights, port, host, token=token)
         page.show(Film.of_plan(page.robot, plan))
         return page
     attempts = read_attempts(file)

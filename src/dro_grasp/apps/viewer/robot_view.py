@@ -8,6 +8,7 @@ from jaxtyping import Float
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
 from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rendering.rasterizer import Colour
 from dro_grasp.grasps.hold import HoldState
 
@@ -47,6 +48,14 @@ class RobotView:
         every = max(1, len(arm) // 6)
         meshes = [mesh for q, p in zip(arm[::every], hand[::every], strict=True) for mesh in robot_meshes(self.robot, q, p)]
         return np.concatenate([mesh.vertices for mesh in meshes])
+
+
+def require_joints(robot: Robot, arm: int, hand: int, what: str) -> None:
+    """Refuse a robot with other numbers of joints than a motion has, by an OptionError."""
+    own = len(robot.arm_joints), len(robot.hand_joints)
+    if own != (arm, hand):
+        raise OptionError(f"robot '{robot.name}' has {own[0]} joints in its arm and {own[1]} in its hand, and {what} {arm} and "
+                          f"{hand}; give its own robot (robot=...), or leave it out")
 
 
 class HoldSign:

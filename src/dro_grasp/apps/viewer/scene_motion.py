@@ -95,7 +95,7 @@ class RobotScenePage(ScenePage):
             self._tell(f"{STRUCTURE_THERE} Afterwards, a click on the table says where to put it.")
             return
         turn = (self._numbers() or ())[2:]
-        self.place.value = " ".join(f"{value:.3g}" for value in [*point[:2].round(3).tolist(), *turn])
+        self.place.value = " ".join(f"{value:g}" for value in [*point[:2].round(3).tolist(), *turn])
         if self.offer is None:
             self._tell(f"It will be put at {point[0]:.2f} {point[1]:.2f} m, once there are grasps.")
             return

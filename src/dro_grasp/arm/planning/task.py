@@ -227,6 +227,8 @@ class Task:
     def advice(self, dropped: dict[str, int]) -> str:
         """What to change, by the reason for which most grasps were dropped."""
         reason = max(dropped, key=lambda r: dropped[r], default="")
+        if not reason:
+            return "there are no grasps to try; give some (grasps=...), or leave them out"
         if reason in (TURNED, SPARED, BESIDE, NARROW):
             return (f"most grasps are {reason}; relax max_tilt, contact_region, keep_out or pregrasp_clearance, or ask for "
                     "more grasps (num=...)")

@@ -120,6 +120,12 @@ class RobotFile:
             raise self.error(f"{what} is {number:g}; expected a number above 0")
         return number
 
+    def pixels(self, value: Any, what: str) -> int:
+        """A whole number above 0."""
+        if (number := self.positive(value, what)) % 1:
+            raise self.error(f"{what} is {number:g}; expected a whole number of pixels")
+        return int(number)
+
     def numbers(self, value: Any, what: str, count: int) -> list[float]:
         """So many numbers in brackets."""
         if not isinstance(value, list | tuple) or len(value) != count:
@@ -158,7 +164,7 @@ class RobotFile:
             pose = self._looking(values)
         else:
             pose = self.pose(values, "camera")
-        width, height = (int(self.positive(values.get(k, d), f"camera: {k}")) for k, d in (("width", 640), ("height", 480)))
+        width, height = (self.pixels(values.get(k, d), f"camera: {k}") for k, d in (("width", 640), ("height", 480)))
         focal = self.positive(values["focal"], "camera: focal")
         x, y = self.numbers(values.get("centre", [(width - 1) / 2, (height - 1) / 2]), "camera: centre", 2)
         return CameraMount(pose, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]), width, height)

@@ -41,19 +41,19 @@ THING_COLOURS: tuple[Colour, ...] = (
 
 @dataclass
 class Recorder(Watcher):
-    """Keeps what a scene looks like, and the plan that is carried out in it."""
+    """Keeps what a scene looks like, and the plans that are carried out in it."""
 
     rate: float = RATE  # Pictures a second
     frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
         default_factory=list)  # Arm, hand [rad or m], and the objects' poses [m]
     objects: tuple[ObjectModel, ...] = ()  # The objects in the scene, the one that is asked for first
     fixtures: tuple[ObjectModel, ...] = ()  # What does not move, in the world
-    plan: MotionPlan | None = None
+    plans: list[tuple[int, MotionPlan]] = field(default_factory=list)  # Each with the number of its first frame
     next_time: float | None = None  # Simulated time of the next frame [s]
 
     def planned(self, seen: PickedObject, made: MotionPlan) -> None:
         """Keep the plan."""
-        self.plan = made
+        self.plans.append((len(self.frames), made))
 
     def moved(self, scene: LiftScene) -> None:
         """Look at the scene."""
@@ -74,7 +74,7 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
         raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
     camera = _camera(robot, recorder)
     still = [Mesh(mesh.vertices, mesh.faces, FIXTURE_COLOUR) for thing in recorder.fixtures for mesh in object_meshes(thing)]
-    colours = [colour_of(i, recorder.plan is not None) for i in range(len(recorder.objects))]
+    colours = [colour_of(i, bool(recorder.plans)) for i in range(len(recorder.objects))]
     things = list(zip(recorder.objects, colours, strict=True))
     pictures = [Image.fromarray(_frame(robot, things, still, camera, *frame)) for frame in recorder.frames]
     lengths = [1000 // RATE] * (len(pictures) - 1) + [1000]

@@ -66,15 +66,16 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
             notes.append(Note("warning", body.name, f"states a mass of {body.mass:g} kg; taken as {LEAST_MASS:g} kg"))
             body.mass = LEAST_MASS
     with mujoco_speaks_to(notes, path):
-        model = _compile(spec, notes)
+        model = compiled(spec, notes)
         if _drop_giants(spec, model, notes):
-            model = _compile(spec, notes)
+            model = compiled(spec, notes)
     _check_numbers(model, path)
     notes.extend(_limit_notes(model))
     return model
 
 
-def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
+def compiled(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
+    """The model of a specification, in which what MuJoCo refuses is repaired."""
     for _ in range(64):  # repairs, after which it fails
         try:
             return spec.copy().compile()

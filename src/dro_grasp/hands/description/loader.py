@@ -23,7 +23,7 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.mesh_files import FETCH, is_pointer
-from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
+from dro_grasp.hands.description.compiling import Note, collide, compile_hand, compiled, guess_unit, mujoco_speaks_to
 from dro_grasp.hands.description.dialects import MOST_UNKNOWN, drop_unknown
 from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
 from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
@@ -249,7 +249,7 @@ def read_key(spec: mujoco.MjSpec, name: str) -> dict[str, float]:
     """Joint values of the keyframe of this name in an MJCF [rad or m]; empty if it has none."""
     if not any(key.name == name for key in spec.keys):
         return {}
-    model = spec.copy().compile()
+    model = compiled(spec.copy(), [])
     values = model.key_qpos[model.key(name).id]
     single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
     joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]

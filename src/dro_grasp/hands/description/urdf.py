@@ -245,7 +245,7 @@ def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes
     if mesh is None:
         return ""
     name = mesh.get("filename", "")
-    file = find_mesh(name, path.parent) or find_mesh(name, path.resolve().parent)
+    file = mesh_of(name, path)
     if file is None:
         return "was not found"
     if is_pointer(file):
@@ -293,6 +293,11 @@ def _candidates(name: str, folder: Path) -> list[Path]:
     roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
     tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
     return [root / tail for root in roots for tail in tails]
+
+
+def mesh_of(name: str, path: Path) -> Path | None:
+    """The file of a mesh that a description names, beside it or beside what it is a link to; None if there is none."""
+    return find_mesh(name, path.parent) or find_mesh(name, path.resolve().parent)
 
 
 def find_mesh(name: str, folder: Path) -> Path | None:

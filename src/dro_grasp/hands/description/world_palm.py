@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.hands.description.compiling import Note, mujoco_speaks_to
+from dro_grasp.hands.description.compiling import Note, compiled, mujoco_speaks_to
 
 APART = 0.4  # Largest distance between the bases of two fingers of a hand [m] (ours)
 LARGEST_PALM = 0.3  # Largest radius of a sphere around a shape of a palm [m] (ours); tables and walls are larger
@@ -59,10 +59,7 @@ def _flattened(spec: mujoco.MjSpec) -> mujoco.MjModel:
     copied = spec.copy()
     for item in [*copied.keys, *copied.actuators, *copied.sensors]:
         copied.delete(item)
-    for body in list(copied.bodies)[1:]:
-        if list(body.joints) and not body.explicitinertial:
-            copied.compiler.boundmass, copied.compiler.boundinertia = 1e-4, 1e-8
-    return copied.compile()
+    return compiled(copied, [])
 
 
 def _numbers_of(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody]) -> list[int]:
