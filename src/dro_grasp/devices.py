@@ -21,7 +21,6 @@ from dro_grasp.errors import OptionError
 
 Result = TypeVar("Result")
 Record = TypeVar("Record")
-State = TypeVar("State")
 
 
 def choose_device(name: str) -> str:
@@ -65,9 +64,6 @@ def one_thread(device: torch.device | str = "cpu") -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-OTHER = "meta"  # Any device that is not the CPU
-
-
 def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
     """The results for all parts of a task, as `map` gives them, by as many threads as PyTorch may use, one for each part.
 
@@ -77,7 +73,7 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
     jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
     on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
     if min(len(jobs), threads) < 2 or not on_cpu:
-        with one_thread("cpu" if on_cpu else OTHER):
+        with one_thread() if on_cpu else nullcontext():
             return [work(*job) for job in jobs]
 
     def prepare() -> None:  # both settings belong to a thread

@@ -23,17 +23,6 @@ ROWS_SHOWN = 16  # Grasps listed in the table
 NO_TRIAL = "none"  # The protocol that stands for no trial
 
 
-class Asked(NamedTuple):
-    """What was asked for, as far as a report repeats it."""
-
-    hand: str  # name
-    num: int
-    seed: int
-    weights: str
-    protocol: str
-    frame: str
-
-
 class Told(NamedTuple):
     """What is told of the grasps of one object."""
 
@@ -42,18 +31,21 @@ class Told(NamedTuple):
     lines: list[str]  # what stands under it
 
 
-def told_of(obj: ObjectModel, made: Prediction, grasps: GraspBatch, asked: Asked) -> Told:
-    """What is told of predicted grasps, which may have been tried since."""
+def told_of(
+    obj: ObjectModel, made: Prediction, grasps: GraspBatch, *, hand: str, num: int, seed: int, weights: str, protocol: str,
+    frame: str,
+) -> Told:
+    """What is told of predicted grasps, which may have been tried since, and repeated of what was asked for."""
     simulated = bool(grasps.evaluated.any())
     success = int(grasps.success.sum()) if simulated else None
-    rate, *interval = success_rate(success or 0, asked.num)
+    rate, *interval = success_rate(success or 0, num)
     report = {
-        "hand": asked.hand, "object": obj.name, "num": len(grasps), "asked": asked.num, "shortage": made.shortage,
+        "hand": hand, "object": obj.name, "num": len(grasps), "asked": num, "shortage": made.shortage,
         "candidates": made.candidates, "dropped": made.dropped, "origin": dict(Counter(made.origin)), "origins": made.origin,
-        "payload": grasps.payload.tolist(), "squeeze_force": grasps.squeeze_force.tolist(), "seed": asked.seed,
-        "weights": asked.weights, "protocol": asked.protocol, "success": success, "success_rate": rate if simulated else None,
+        "payload": grasps.payload.tolist(), "squeeze_force": grasps.squeeze_force.tolist(), "seed": seed,
+        "weights": weights, "protocol": protocol, "success": success, "success_rate": rate if simulated else None,
         "interval_95": interval if simulated else None, "reasons": count_failures(grasps), "next": next_steps(grasps),
-        "seconds": {}, "output": None, "picture": None, "frame": asked.frame,
+        "seconds": {}, "output": None, "picture": None, "frame": frame,
     }
     return Told(report, _rows(grasps, made.origin), _lines(report, grasps))
 

@@ -253,7 +253,7 @@ class Generate:
 
     def _finish(self, job: Job, predicted: Predicted, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """Trials, files and report of one object."""
-        from dro_grasp.apps.report import Asked, protocol_for, told_of
+        from dro_grasp.apps.report import protocol_for, told_of
         from dro_grasp.grasps.sources import with_sources
 
         problem, made, begin = predicted.problem, predicted.made, time.perf_counter()
@@ -263,9 +263,9 @@ class Generate:
         middle = time.perf_counter()
         grasps = self._evaluate(problem, made.grasps)
         seconds |= {**made.seconds, "trial": time.perf_counter() - middle if bool(grasps.evaluated.any()) else 0.0}
-        told = told_of(obj, made, grasps, Asked(
-            job.hand.name, self.num, self.seed, job.predictor.weights_name, protocol_for(obj, self.protocol),
-            "object" if job.camera is None else job.camera.frame))
+        told = told_of(
+            obj, made, grasps, hand=job.hand.name, num=self.num, seed=self.seed, weights=job.predictor.weights_name,
+            protocol=protocol_for(obj, self.protocol), frame="object" if job.camera is None else job.camera.frame)
         told.report["output"] = None if output is None else str(output)
         middle = time.perf_counter()
         kept, points = grasps, made.points

@@ -176,12 +176,6 @@ def _unit(vector: Place) -> Place:
 
 
 REFINEMENTS = 3  # Rounds in which opening signs and palm are derived from each other (ours)
-ROLLED_UP = 0.15
-"""Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). At the limits of their
-ranges, 16 hands keep 0.19 to 1."""
-ALL_ROLLED_UP = 0.5
-"""The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
-fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
 AHEAD = 0.5  # Cosine between a palm's direction and the side to which fingers close from which on it faces that side (ours)
 MOST_UNSURE = 6  # Most fingers that bend as far back as forth of which all combinations of sides are tried (ours)
 FACING = 0.8

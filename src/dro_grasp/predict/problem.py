@@ -42,7 +42,6 @@ class GraspProblem:
     fixed: tuple[str, ...] = ()
     """Names of those that describe a place as it is, which nobody can relax: no advice names them."""
     _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)
-    _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuse what is no hand or no object, an absent device, and constraints that leave nothing of the object.
@@ -148,7 +147,6 @@ class GraspProblem:
     def beside(self, obj: ObjectModel) -> GraspProblem:
         """The problem of another object, with what is prepared of the hand shared."""
         other = GraspProblem(self.hand, obj, self.device, self.constraints)
-        vars(other)["_thinned"] = self._thinned
         around = self.constraints.workspace(obj, self.hand_reach)
         vars(other)["_default_energy"] = self._default_energy.on(obj, around)
         return other
@@ -159,9 +157,7 @@ class GraspProblem:
         Raises:
             OptionError: The hand has fewer points.
         """
-        if count not in self._thinned:
-            self._thinned[count] = self.hand.with_points(count).to(self.device)
-        return self._thinned[count]
+        return self.hand.with_points(count).to(self.device)
 
     def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
         """Random surface points of the object, or of the contact region, on the device [m]."""

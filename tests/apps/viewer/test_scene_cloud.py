@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dro_grasp.apps.viewer.scene_cloud import colours_of, first_hit, normals_of, place_on_thing, shades
+from dro_grasp.apps.viewer.scene_cloud import colours_of, first_hit, normals_of, shades
 from dro_grasp.apps.viewer.scene_view import rgb
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR
 from dro_grasp.objects.perception.segmentation import NOTHING, OTHER, STRUCTURE
@@ -82,5 +82,5 @@ def test_a_place_on_a_thing_means_it_alone() -> None:
     assert scene.segments.count == 2
     assert scene.sight is not None
     for number in range(2):
-        chosen = scene.chosen(at=place_on_thing(scene, number))
+        chosen = scene.chosen(at=scene.spot(number))
         assert (scene.segments.labels[chosen.own] == number).all()

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.apps.library import Kind, Library, store_upload
-from dro_grasp.apps.report import NO_TRIAL, Asked, doubt, protocol_for, require_trial, told_of
+from dro_grasp.apps.report import NO_TRIAL, doubt, protocol_for, require_trial, told_of
 from dro_grasp.apps.server.messages import (
     GenerateAnswer,
     GenerateCall,
@@ -136,8 +136,8 @@ class Answerer:
         grasps = grasps if protocol == NO_TRIAL else evaluate(problem, grasps, protocol, progress)
         trial = time.perf_counter() - begin if bool(grasps.evaluated.any()) else 0.0
         frame = "object" if call.camera is None else call.camera.frame
-        told = told_of(obj, made, grasps, Asked(
-            hand.name, request.num, request.seed, self.predictor.weights_name, protocol, frame))
+        told = told_of(obj, made, grasps, hand=hand.name, num=request.num, seed=request.seed,
+                       weights=self.predictor.weights_name, protocol=protocol, frame=frame)
         odd = [doubt(problem.constraints, obj, call.camera is not None), made.shortage]
         kept = grasps[grasps.success] if call.only_successful else grasps
         camera = None if call.camera is None else NamedMotion(call.camera.frame, sent_pose(call.camera).float())

@@ -177,17 +177,3 @@ def first_hit(
         return None
     near = met[depth[met] < depth[met].min() + DEEP]
     return int(near[aside[near].argmin()])
-
-
-def place_on_thing(scene: Scene, number: int) -> Float[np.ndarray, "3"]:
-    """A point of a thing that lies in the box of no other one, if there is one, so that it means this thing alone [m]."""
-    assert scene.sight is not None
-    world, labels = scene.sight.world(), scene.segments.labels
-    own = world[labels == number]
-    alone = np.ones(len(own), bool)
-    for other in range(scene.segments.count):
-        if other != number:
-            box = world[labels == other]
-            alone &= ~((own >= box.min(0)) & (own <= box.max(0))).all(1)
-    kept = own[alone] if alone.any() else own
-    return kept[len(kept) // 2]

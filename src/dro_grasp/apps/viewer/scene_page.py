@@ -18,7 +18,7 @@ from dro_grasp.apps.library import Library
 from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES
 from dro_grasp.apps.viewer.grasp_page import GRASP_FILE, exported
 from dro_grasp.apps.viewer.hand_view import GraspMarks, HandView, colour_of
-from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud, place_on_thing
+from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud
 from dro_grasp.apps.viewer.scene_view import Client, Closed, Page, escaped, rgb
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera
@@ -305,7 +305,7 @@ class ScenePage(Page):
         try:
             begin = time.perf_counter()
             self._say(f"**Thing {wish.number + 1}**: its unseen side is estimated ...")
-            place = place_on_thing(wish.cloud.scene, wish.number) if wish.side is None else wish.side
+            place = wish.cloud.scene.spot(wish.number) if wish.side is None else wish.side
             found = wish.cloud.scene.object_at(place, part=wish.side is not None, name=name)
             self._still(wish)
             wish.cloud.colour(wish.number, found.chosen, found.obj)

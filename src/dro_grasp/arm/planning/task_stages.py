@@ -24,37 +24,29 @@ SHORTEST = 0.001  # Straight motions that are shorter are none [m] (ours)
 
 def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
     """The stages of a plan for a robot, in their order, as plain values: metres, radians, quaternions WXYZ, Nm or N."""
-    hand, thing, wrist = robot.hand_joints, plan.notes.object, robot.hand.wrist_link
-    links, frame = list(robot.hand.tree.link_names), plan.notes.frame
+    hand, wrist, thing = robot.hand_joints, robot.hand.wrist_link, plan.notes.object
+    touching = {"first": thing, "second": list(robot.hand.tree.link_names)}
+    held = {"objects": [thing], "link": wrist}
+
+    def shaped(name: str, stage: str) -> dict[str, Any]:
+        return _joints(name, hand, _last(plan, HAND, stage))
+
+    def ways(*names: str) -> list[dict[str, Any]]:
+        return [part for name in names for part in _straight(name, plan, robot)]
+
+    stages = [shaped("open", "reach"), _pose("reach", plan, robot), shaped("shape", "shape"),
+              {"name": "hand may touch", "type": "ModifyPlanningScene", "allow_collisions": touching}]
     if plan.notes.slide is not None:
-        return [{"name": "current state", "type": "CurrentState"}] + [stage | {"frame": frame} for stage in (
-            _joints("open", HAND, hand, _last(plan, HAND, "reach")), _pose("reach", plan, robot, "reach"),
-            _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
-            {"name": "hand may touch", "type": "ModifyPlanningScene",
-             "allow_collisions": {"first": thing, "second": links}},
-            *(part for name in ("approach", "press", "slide", "retreat") for part in _straight(name, plan, robot, name)),
-            _pose("look again", plan, robot, "look again"))]
-    allowed = {"allow_collisions": {"first": thing, "second": links}}
-    stages = [
-        {"name": "current state", "type": "CurrentState"},
-        _joints("open", HAND, hand, _last(plan, HAND, "reach")),
-        _pose("reach", plan, robot, "reach"),
-        _joints("shape", HAND, hand, _last(plan, HAND, "shape")),
-        {"name": "hand may touch", "type": "ModifyPlanningScene", **allowed},
-        *_straight("approach", plan, robot, "approach"),
-        _joints("close", HAND, hand, plan.squeeze, plan.notes.squeeze_torque) | _expected(plan, hand),
-        {"name": "attach", "type": "ModifyPlanningScene", "attach_objects": {"objects": [thing], "link": wrist}},
-        *_straight("lift", plan, robot, "lift"),
-    ]
+        stages += [*ways("approach", "press", "slide", "retreat"), _pose("look again", plan, robot)]
+    else:
+        stages += [
+            *ways("approach"), _joints("close", hand, plan.squeeze, plan.notes.squeeze_torque) | _expected(plan, hand),
+            {"name": "attach", "type": "ModifyPlanningScene", "attach_objects": held}, *ways("lift")]
     if plan.notes.place is not None:
         stages += [
-            _pose("carry", plan, robot, "carry"),
-            *_straight("lower", plan, robot, "lower"),
-            _joints("release", HAND, hand, _last(plan, HAND, "release")),
-            {"name": "detach", "type": "ModifyPlanningScene", "detach_objects": {"objects": [thing], "link": wrist}},
-            *_straight("retreat", plan, robot, "retreat"),
-        ]
-    return [stage | ({"frame": frame} if stage["type"] != "CurrentState" else {}) for stage in stages]
+            _pose("carry", plan, robot), *ways("lower"), shaped("release", "release"),
+            {"name": "detach", "type": "ModifyPlanningScene", "detach_objects": held}, *ways("retreat")]
+    return [{"name": "current state", "type": "CurrentState"}, *(stage | {"frame": plan.notes.frame} for stage in stages)]
 
 
 def task_yaml(plan: MotionPlan, robot: Robot) -> str:
@@ -72,10 +64,10 @@ def _last(plan: MotionPlan, group: str, stage: str) -> Float[np.ndarray, " n"]:
 
 
 def _joints(
-    name: str, group: str, names: tuple[str, ...], values: Float[np.ndarray, " n"], effort: tuple[float, ...] | None = None
+    name: str, names: tuple[str, ...], values: Float[np.ndarray, " n"], effort: tuple[float, ...] | None = None
 ) -> dict[str, Any]:
-    """A motion to joints."""
-    stage: dict[str, Any] = {"name": name, "type": "MoveTo", "group": group, "goal": {"joints": _named(names, values)}}
+    """A motion of the hand to joints."""
+    stage: dict[str, Any] = {"name": name, "type": "MoveTo", "group": HAND, "goal": {"joints": _named(names, values)}}
     return stage if effort is None else stage | {"effort": _named(names, np.array(effort))}
 
 
@@ -88,18 +80,18 @@ def _expected(plan: MotionPlan, names: tuple[str, ...]) -> dict[str, Any]:
     return {"expected": told if known.weight is None else {**told, "weight": round(known.weight, DIGITS)}}
 
 
-def _pose(name: str, plan: MotionPlan, robot: Robot, stage: str) -> dict[str, Any]:
+def _pose(name: str, plan: MotionPlan, robot: Robot) -> dict[str, Any]:
     """A free motion of the arm to the wrist pose at the end of a stage; its joints reach it without a collision."""
-    joints = _last(plan, ARM, stage)
+    joints = _last(plan, ARM, name)
     T = robot.T_world_wrist(joints)
     pose = {"position": _rounded(T[:3, 3]), "orientation_wxyz": _rounded(wxyz(T[:3, :3]))}
     goal = {"pose": pose, "joints": _named(robot.arm_joints, joints)}
     return {"name": name, "type": "MoveTo", "group": ARM, "ik_frame": robot.hand.wrist_link, "goal": goal}
 
 
-def _straight(name: str, plan: MotionPlan, robot: Robot, stage: str) -> list[dict[str, Any]]:
-    """A straight motion of the wrist; nothing where it stays."""
-    rows = plan.arm.position[plan.part(stage)]
+def _straight(name: str, plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
+    """The straight motion of the wrist in a stage; nothing where it stays."""
+    rows = plan.arm.position[plan.part(name)]
     way = robot.T_world_wrist(rows[-1])[:3, 3] - robot.T_world_wrist(rows[0])[:3, 3]
     length = float(np.linalg.norm(way))
     if length < SHORTEST:

@@ -16,7 +16,6 @@ STEEL = 7850.0  # Density [kg/m^3]; this and the next are the usual values of ta
 IRON = 7200.0  # Density of cast iron [kg/m^3]
 BRASS = 8500.0  # Density [kg/m^3]
 PORCELAIN = 2400.0  # Density [kg/m^3]
-GLASS = 2500.0  # Density [kg/m^3]
 ACRYLIC = 1180.0  # Density [kg/m^3]
 
 
