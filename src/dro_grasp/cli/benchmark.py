@@ -13,6 +13,7 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
+from dro_grasp.errors import ObjectError, OptionError
 
 if TYPE_CHECKING:
     from dro_grasp.compare.methods import Method
@@ -82,7 +83,6 @@ class Benchmark:
     def _measure(self, most: int | None) -> int:
         """All of it, with at most so many objects."""
         from dro_grasp.compare.stages import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
-        from dro_grasp.errors import ObjectError, OptionError
         from dro_grasp.hands.library import load_hand
         from dro_grasp.predict.config import GraspRequest
         from dro_grasp.predict.constraints import Constraints

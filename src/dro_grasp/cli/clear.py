@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from dro_grasp.cli.inputs import Flag, Friction, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.extras import require_extra
+from dro_grasp.files import UNTYPED, check_output, reading, replacing
 
 if TYPE_CHECKING:
     from dro_grasp.arm.clearing.loop import Pick
@@ -59,9 +62,6 @@ class Clear:
         from dro_grasp.arm.clearing.trial import clear_trial
         from dro_grasp.arm.robots.loading import load_robot
         from dro_grasp.arm.tabletop.animation import FORMATS
-        from dro_grasp.errors import OptionError
-        from dro_grasp.extras import require_extra
-        from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import describe_weights
         from dro_grasp.objects.catalogue import load_object, resolve_objects
         from dro_grasp.predict.predictor import GraspPredictor
@@ -163,9 +163,6 @@ def _drawn(total: int, count: int, seed: int, number: int) -> list[int]:
 
 def _read(path: Path | None, key: dict[str, Any]) -> dict[int, dict[str, Any]]:
     """Tables of the same key in a file, by number."""
-    from dro_grasp.errors import GraspFileError
-    from dro_grasp.files import UNTYPED, reading
-
     if path is None or not path.exists():
         return {}
     with reading(path, GraspFileError, "a file of cleared tables (.jsonl); name another one, or move this one away", *UNTYPED):
@@ -178,8 +175,6 @@ def _counted(number: int, what: str) -> str:
 
 
 def _append(path: Path | None, line: dict[str, Any]) -> None:
-    from dro_grasp.files import replacing
-
     if path is None:
         return
     before = path.read_text(encoding="utf-8") if path.exists() else ""

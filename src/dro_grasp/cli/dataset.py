@@ -14,6 +14,8 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.files import check_folder, check_output, make_folder
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -88,8 +90,6 @@ class Synthesize:
         return code
 
     def _check_numbers(self) -> None:
-        from dro_grasp.errors import OptionError
-
         for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
             if value < 1:
                 raise OptionError(f"{option} is {value}; give at least 1")
@@ -103,8 +103,6 @@ class Synthesize:
             raise OptionError(f"--idle is {self.idle}; give a probability, from 0 (every finger holds) to 1")
 
     def _part(self) -> tuple[int, int]:
-        from dro_grasp.errors import OptionError
-
         found = re.fullmatch(r"(\d+)/(\d+)", self.shard)
         if found is None:
             raise OptionError(f"--shard is '{self.shard}'; give a part from 1 on, and of how many, such as 3/16")
@@ -135,8 +133,6 @@ class Import:
 
     def run(self) -> int:
         """Read all files, find hands and objects, write grasp files."""
-        from dro_grasp.errors import GraspFileError, OptionError
-        from dro_grasp.files import check_folder, make_folder
         from dro_grasp.training.data.collections.importing import import_grasps
         from dro_grasp.training.data.collections.merging import file_name
 
@@ -211,7 +207,6 @@ class Report(DataSets):
 
     def run(self) -> int:
         """Measure, print, write the page."""
-        from dro_grasp.files import check_output
         from dro_grasp.training.data.collections.coverage import measure_coverage
         from dro_grasp.training.data.collections.report import write_report
 
@@ -245,7 +240,6 @@ class Merge(DataSets):
 
     def run(self) -> int:
         """Merge, and write the files."""
-        from dro_grasp.files import make_folder
         from dro_grasp.training.data.collections.merging import file_name, merge, require_choice
 
         require_choice(self.per_pair)
@@ -366,7 +360,6 @@ class BundleCommand(DataSets):
 
     def run(self) -> int:
         """Select the grasps of the split, find their hands and objects, write the bundle."""
-        from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
         from dro_grasp.training.data.collections.bundling import make_bundle
 

@@ -11,6 +11,8 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.files import check_output
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
 if TYPE_CHECKING:
@@ -50,7 +52,6 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate object by object, then report."""
-        from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch, load_grasps
         from dro_grasp.grasps.sources import hand_of, require_one_object
         from dro_grasp.predict.stages import evaluate
@@ -83,7 +84,6 @@ class Evaluate:
         self, hand: Hand, grasps: GraspBatch
     ) -> tuple[list[tuple[str, GraspProblem, GraspBatch]], dict[str, GraspBatch]]:
         """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds."""
-        from dro_grasp.errors import ObjectError
         from dro_grasp.grasps.sources import object_of, with_mass_of
         from dro_grasp.predict.problem import GraspProblem
         from dro_grasp.simulation.scene import require_simulable
@@ -147,7 +147,6 @@ class Evaluate:
 
 def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:
     """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones."""
-    from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import made_for_another
 
     if stored in {"", given.sha256}:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +11,8 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say
+from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.files import check_folder, check_output, make_folder, replacing
 from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
@@ -41,7 +43,6 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
-        from dro_grasp.files import check_folder, check_output, make_folder
         from dro_grasp.grasps.export.writers import Frame
         from dro_grasp.grasps.sources import require_one_object
 
@@ -59,7 +60,7 @@ class Export:
         written, labels = list[Path](), set[str]()
         for name, job in jobs.items():
             plain = name.replace("/", "-")
-            label = next(each for each in (plain, *(f"{plain}-{k}" for k in count(2))) if each not in labels)
+            label = next(each for each in chain([plain], (f"{plain}-{k}" for k in count(2))) if each not in labels)
             labels.add(label)
             place = target / (label if form.file_per_grasp else f"{label}{form.suffix}")
             written += write(form.content(job), place if len(jobs) > 1 else target, form.suffix)
@@ -71,7 +72,6 @@ class Export:
 
     def _load(self) -> GraspBatch:
         """The requested grasps."""
-        from dro_grasp.errors import GraspFileError
         from dro_grasp.grasps.batch import load_grasps
 
         grasps = load_grasps(self.file)
@@ -107,8 +107,6 @@ class Export:
 
 def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
     """Write one file at the path, or one per grasp in a folder of that name; returns their paths."""
-    from dro_grasp.files import make_folder, replacing
-
     files = {path: content} if isinstance(content, bytes) else {
         make_folder(path) / f"{i}{suffix}": entry for i, entry in enumerate(content)}
     for place, entry in files.items():
@@ -119,8 +117,6 @@ def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
 
 def refuse_mixing(folder: Path, suffix: str) -> None:
     """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new."""
-    from dro_grasp.errors import OutputError
-
     old = next((path for pattern in (f"*{suffix}", f"*/*{suffix}") for path in folder.glob(pattern)), None)
     if old is not None:
         raise OutputError(f"cannot write grasps into {folder}: it holds {suffix[1:]} files already "

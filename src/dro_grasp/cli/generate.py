@@ -13,6 +13,9 @@ from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say
 from dro_grasp.cli.remote import generate_at, server_of
 from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
+from dro_grasp.errors import DroGraspError, OptionError, OutputError
+from dro_grasp.extras import require_extra
+from dro_grasp.files import check_folder, check_output, given_path, make_folder
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -109,7 +112,6 @@ class Generate:
         self.check_scene()
         if (address := server_of(self.server)) is not None:
             return generate_at(address, self)
-        from dro_grasp.errors import DroGraspError
 
         with progress_bar("loading libraries, hand and weights", self.json):
             names, outputs, pictures, job = self._prepare()
@@ -139,7 +141,6 @@ class Generate:
         """Names of the objects, where their files and pictures go, and what they share; libraries take seconds to load."""
         begin = time.perf_counter()
         load_libraries()
-        from dro_grasp.files import make_folder
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
@@ -179,9 +180,6 @@ class Generate:
 
     def check_scene(self) -> None:
         """Refuse options that contradict one another or the kind of object, by an OptionError."""
-        from dro_grasp.errors import OptionError
-        from dro_grasp.extras import require_extra
-
         check_choice(self)
         if self.scene is not None and self.keep_table:
             raise OptionError("--keep-table keeps a table that is in an object's own cloud; leave it out: the table of a scene "
@@ -209,8 +207,6 @@ class Generate:
 
     def _predict(self, job: Job, names: list[str]) -> list[Predicted | DroGraspError]:
         """What is predicted of each object, or why there is nothing."""
-        from dro_grasp.errors import DroGraspError
-
         found: list[Any] = []
         for name in names:
             try:
@@ -307,7 +303,6 @@ class Generate:
                 say_aside(f"warning: {name}: no grasp succeeded, so {outcome}")
 
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
-        from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
 
         if camera is None:
@@ -386,9 +381,6 @@ class ObjectResult:
 
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
-    from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_folder, check_output
-
     if path is None:
         return [None] * len(names)
     if not several:

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dro_grasp.cli.output import say_aside
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.files import check_output
 
 if TYPE_CHECKING:
     from dro_grasp.arm.robots.robot import Robot
@@ -23,9 +25,6 @@ CHOICES = ("--at", "--pixel", "--mask", "--nearest")  # Options that say which t
 
 def check_choice(command: Generate | Plan, own: tuple[str, ...] = ()) -> None:
     """Refuse options that contradict one another, by an OptionError; `own` ones mean something without a scene, too."""
-    from dro_grasp.errors import OptionError
-    from dro_grasp.files import check_output
-
     if (command.object is None) == (command.scene is None):
         raise OptionError("give --object NAME|PATH, or --scene CLOUD|DEPTH with the thing that is meant "
                           f"({', '.join(CHOICES)}); {'neither is' if command.object is None else 'both are'} given")
@@ -71,8 +70,6 @@ def find_on_table(scene: Scene, robot: Robot, command: Plan) -> PickedObject:
 @contextmanager
 def _picture_if_refused(scene: Scene, path: Path | None) -> Iterator[None]:
     """Draw what the scene shows where nothing of it can be taken."""
-    from dro_grasp.errors import ObjectError
-
     try:
         yield
     except ObjectError:

@@ -13,6 +13,8 @@ import tyro
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say
+from dro_grasp.errors import OptionError, OutputError
+from dro_grasp.files import check_output, command, make_folder, reading, replacing
 
 if TYPE_CHECKING:
     from dro_grasp.training.made_hands.making import MadeHand
@@ -40,8 +42,6 @@ class Make:
 
     def run(self) -> int:
         """Make, write, list and draw."""
-        from dro_grasp.errors import OptionError, OutputError
-        from dro_grasp.files import check_output, make_folder, replacing
         from dro_grasp.training.made_hands.making import hand_name, make_hand
 
         if self.num < 1:
@@ -91,9 +91,6 @@ class Make:
 
 def _listing(path: Path) -> dict[str, dict[str, Any]]:
     """Rows of the hands that a folder's listing has, by name; nothing where there is no listing."""
-    from dro_grasp.errors import OutputError
-    from dro_grasp.files import reading
-
     if not path.exists():
         return {}
     with reading(path, OutputError, "the listing of a folder of made hands; name another folder", KeyError), \
@@ -126,8 +123,6 @@ class Vary:
 
     def run(self) -> int:
         """Read, change, write."""
-        from dro_grasp.errors import OptionError
-        from dro_grasp.files import check_output, command, replacing
         from dro_grasp.hands.library import locate_hand
         from dro_grasp.hands.variants import vary_hand
 
@@ -162,7 +157,6 @@ class Check:
 
     def run(self) -> int:
         """Check, print, draw."""
-        from dro_grasp.files import check_output
         from dro_grasp.hands.check import check_hand, picture
 
         if self.picture is not None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from dro_grasp.errors import ObjectError, UngraspableError
 from dro_grasp.simulation.protocols import PROTOCOLS
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ def load_obstacle(name: str) -> ObjectModel:
     Raises:
         ObjectError: It cannot be loaded as a thing; of one of another size, and of a sheet, the message says how it is avoided.
     """
-    from dro_grasp.errors import ObjectError, UngraspableError
     from dro_grasp.objects.catalogue import load_object
 
     try:

@@ -10,6 +10,7 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag
 from dro_grasp.cli.output import print_json, print_result, say
+from dro_grasp.errors import WeightsError
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,6 @@ class Verify:
 
     def run(self) -> int:
         """Check all files, then report; the exit code is 2 if one is damaged."""
-        from dro_grasp.errors import WeightsError
         from dro_grasp.network.checkpoints import SMALL, verify_weights, weights_names
 
         rows = []

@@ -12,6 +12,9 @@ import tyro
 from dro_grasp.cli.given_scene import check_choice, find_on_table
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, load_obstacle, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
+from dro_grasp.errors import OptionError
+from dro_grasp.extras import require_extra
+from dro_grasp.files import check_output, given_path, replacing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,9 +112,6 @@ class Plan:
         from dro_grasp.arm.planning.planner import plan
         from dro_grasp.arm.planning.task import PlanConfig
         from dro_grasp.arm.robots.loading import load_robot
-        from dro_grasp.errors import OptionError
-        from dro_grasp.extras import require_extra
-        from dro_grasp.files import check_output
         from dro_grasp.objects.scenery import load_scene
         from dro_grasp.objects.shape import with_mass
         from dro_grasp.predict.predictor import GraspPredictor
@@ -164,7 +164,6 @@ class Plan:
         """Write the files that were asked for; returns their paths."""
         from dro_grasp.arm.planning.motion import trajectory_csv, trajectory_yaml
         from dro_grasp.arm.planning.task_stages import task_yaml
-        from dro_grasp.files import replacing
 
         if self.efforts and made.notes.squeeze_torque is None:
             say_aside("warning: the efforts of the grasp are unknown, so the hand's points have none; close with a low limit")
@@ -181,8 +180,6 @@ class Plan:
 
     def check_scene(self) -> None:
         """Refuse options that contradict one another, by an OptionError."""
-        from dro_grasp.errors import OptionError
-
         check_choice(self, own=("--at",))
         if self.at is not None:
             wanted, such = (("x and y", "0.5 0.1"), ("x, y and z", "0.5 0.1 0.05"))[self.scene is not None]
@@ -201,7 +198,6 @@ class Plan:
 
         from dro_grasp.arm.robots.robot import Table
         from dro_grasp.arm.tabletop.table_scene import PickedObject, at_seen_height, seen_on_table
-        from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.perception.scan import load_scan
@@ -229,7 +225,6 @@ class Plan:
 
     def _camera(self, robot: Robot) -> SceneCamera | None:
         """The camera in the world; None if the object is in the world's frame."""
-        from dro_grasp.errors import OptionError
         from dro_grasp.objects.perception.scene_files import as_camera
 
         if self.camera is None:
@@ -289,14 +284,11 @@ class Tabletop:
 
     def run(self, make: Callable[..., Attempt] | None = None) -> int:
         """Run what is missing, or make it in another way, store and print."""
-        from dro_grasp.extras import require_extra
-
         require_extra("arm")
         from dro_grasp.arm.planning.task import PlanConfig
         from dro_grasp.arm.tabletop.animation import FORMATS, draw_attempt
         from dro_grasp.arm.tabletop.experiment import TabletopConfig
         from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
-        from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
 
         if self.video is not None:
@@ -370,7 +362,6 @@ class CheckRobot:
     def run(self) -> int:
         """Check, print, draw."""
         from dro_grasp.arm.robot_check import check_robot, draw_robot
-        from dro_grasp.files import check_output
 
         if self.picture is not None:
             check_output(self.picture, ".png")

@@ -10,6 +10,8 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_result, print_table, say_aside
+from dro_grasp.errors import OptionError
+from dro_grasp.files import check_output
 
 if TYPE_CHECKING:
     from dro_grasp.network.network import DistanceNetwork
@@ -47,7 +49,6 @@ class Stage:
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
         """The configuration of the preset, else of the initial weights, else of `multi`."""
-        from dro_grasp.errors import OptionError
         from dro_grasp.network.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
         given = None if initial is None or self.preset is not None else initial.config
@@ -92,7 +93,6 @@ class Pretrain(Stage):
 
         import torch
 
-        from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.provenance import made_by
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
@@ -166,8 +166,6 @@ class Train(Stage):
         """Train and save."""
         import dataclasses
 
-        from dro_grasp.errors import OptionError
-        from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights
         from dro_grasp.provenance import made_by
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig

@@ -13,6 +13,9 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import say
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.extras import require_extra
+from dro_grasp.files import check_output
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -62,8 +65,6 @@ class View:
 
     def run(self, show: Callable[[ServedPage], None] | None = None) -> int:
         """Serve the page, or show it in another way, with the grasps of the file if there is one."""
-        from dro_grasp.extras import require_extra
-
         require_extra("apps")
         from dro_grasp.apps.viewer.scene_view import serve
 
@@ -93,8 +94,6 @@ class View:
 
     def _check_scene(self) -> None:
         """Refuse options that contradict one another, by an OptionError."""
-        from dro_grasp.errors import OptionError
-
         if self.scene is None:
             if self.camera is not None:
                 raise OptionError("--camera is that of a scene; give the scene, too: --scene CLOUD|DEPTH")
@@ -109,7 +108,6 @@ class View:
 
     def _of_scene(self, file: Path) -> Callable[[Client, Lock], Page]:
         """What makes the page of a scene, which is read and taken apart once for all browsers."""
-        from dro_grasp.extras import require_extra
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.perception.scene_files import SceneCamera
         from dro_grasp.objects.scenery import load_scene
@@ -126,7 +124,6 @@ class View:
             require_extra("arm")
             from dro_grasp.apps.viewer.scene_motion import RobotScenePage
             from dro_grasp.arm.robots.loading import load_robot
-            from dro_grasp.errors import OptionError
 
             robot = load_robot(self.robot)
             if camera == ROBOT:
@@ -200,8 +197,6 @@ class Picture:
 
     def run(self) -> int:
         """Load the file and draw."""
-        from dro_grasp.errors import OptionError
-        from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
         from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
@@ -223,8 +218,6 @@ class Picture:
 
     def pairs(self, grasps: GraspBatch) -> list[tuple[ObjectModel, GraspBatch]]:
         """Objects on the sheet, each with those of its grasps that are drawn."""
-        from dro_grasp.errors import GraspFileError
-
         def wanted(own: GraspBatch) -> GraspBatch:
             return own if not self.only_successful else own[own.trial_success]
 
@@ -239,8 +232,6 @@ class Picture:
         return pairs
 
     def _check_options(self) -> None:
-        from dro_grasp.errors import OptionError
-
         for option, value in (("--count", self.count), ("--columns", self.columns)):
             if value < 1:
                 raise OptionError(f"{option} is {value}; give at least 1")
@@ -277,8 +268,6 @@ class Serve:
 
     def run(self) -> int:
         """Check, load, and serve until Ctrl-C or SIGTERM."""
-        from dro_grasp.extras import require_extra
-
         require_extra("apps")
         from dro_grasp.apps.server.answering import ServerConfig
         from dro_grasp.apps.server.http_server import Access, listening_socket, serve_grasps
@@ -312,7 +301,6 @@ def is_motion(file: Path) -> bool:
 
 def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
     """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first."""
-    from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import object_of
 
     parts = dict(grasps.by_object())

@@ -7,7 +7,7 @@ documentation of UsdGeom and of variant sets; names that begin with `dro_grasp:`
 from __future__ import annotations
 
 from importlib import import_module
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
@@ -106,7 +106,7 @@ def _add_links(stage: Any, hand: Hand) -> list[str]:
     taken = dict[str, str]()
     for name in hand.tree.link_names:
         valid = Tf.MakeValidIdentifier(name)
-        taken[next(each for each in (valid, *(f"{valid}_{k}" for k in count(1))) if each not in taken)] = name
+        taken[next(each for each in chain([valid], (f"{valid}_{k}" for k in count(1))) if each not in taken)] = name
     paths = [f"/World/hand/{valid}" for valid in taken]
     for path, name in zip(paths, taken.values(), strict=True):
         link = UsdGeom.Xform.Define(stage, path)
