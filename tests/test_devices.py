@@ -134,3 +134,9 @@ def test_no_more_is_waited_for_than_the_cpu_s_own(device: str) -> None:
     assert where_any(mask.to(device)) == slice(None)
     assert not may_hold(torch.zeros(2, dtype=torch.bool))
     assert may_hold(torch.zeros(2, dtype=torch.bool).to(device))
+
+
+@pytest.mark.parametrize("name", ["xpu", "nonsense"])
+def test_a_device_that_nothing_runs_on_is_refused(name: str) -> None:
+    with pytest.raises(OptionError, match=f"device is '{name}'; give cpu, cuda, cuda:1 or mps"):
+        require_device(name)

@@ -33,11 +33,24 @@ def require_device(name: str) -> None:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise OptionError(f"device is '{name}'; give cpu, cuda, cuda:1 or mps") from None
+        device = None
+    if device is None or not _computes(device):
+        raise OptionError(f"device is '{name}'; give cpu, cuda, cuda:1 or mps")
     count = {"cuda": torch.cuda.device_count, "mps": torch.mps.device_count}.get(device.type)
     if count is not None and count() <= (device.index or 0):
         raise OptionError(f"device is '{name}', but torch {torch.__version__} finds {count() or 'no'} such; use device='cpu', "
                           f"which always works, or install a build of torch with {device.type.upper()}")
+
+
+def _computes(device: torch.device) -> bool:
+    """Whether PyTorch knows a device of this kind, or says of itself how many there are."""
+    if device.type in ("cpu", "cuda", "mps"):
+        return True
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, NotImplementedError, RuntimeError):  # what PyTorch raises for kinds that it was not built with
+        return False
+    return True
 
 
 def cores() -> int:

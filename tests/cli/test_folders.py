@@ -12,6 +12,7 @@ import trimesh
 from PIL import Image
 
 from dro_grasp.apps.viewer.studio import StudioServer
+from dro_grasp.cli.generate import paths_per_object
 from dro_grasp.cli.main import main, parse
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
@@ -192,3 +193,10 @@ def test_folders_of_several_hands_or_of_no_grasp_are_refused(folder: Path, tmp_p
         load_grasps(tmp_path)
     with pytest.raises(GraspFileError, match="no grasp file"):
         load_grasps(tmp_path / "nowhere.parquet")
+
+
+def test_results_of_objects_whose_names_look_alike_keep_a_file_each(tmp_path: Path) -> None:
+    names = ["a/mug.obj", "a/mug.ply", "a/mug_obj.stl", "b/can.stl"]
+    files = paths_per_object(tmp_path, names, True, ".parquet")
+    assert [file.name for file in files if file is not None] == [
+        "mug_obj.parquet", "mug_ply.parquet", "mug_obj-2.parquet", "can.parquet"]

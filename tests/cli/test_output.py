@@ -9,7 +9,7 @@ import torch
 from scipy.special import expit
 
 from dro_grasp.cli.main import main
-from dro_grasp.cli.output import print_table
+from dro_grasp.cli.output import print_table, say, say_file
 from dro_grasp.grasps.batch import percent
 from dro_grasp.network.checkpoints import SMALL, weights_names
 from dro_grasp.training.data.collections.report import LABEL, short_names
@@ -90,3 +90,9 @@ def test_a_device_that_is_not_there_is_refused(command: list[str], tmp_path: Pat
     assert "device is 'cuda:77'" in said.err
     assert "--device cpu" in said.err
     assert not (tmp_path / "new").exists()
+
+
+def test_names_of_files_stay_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    say_file("grasps", "seed=0.parquet")
+    say("seed=0 is given")
+    assert capsys.readouterr().out.splitlines() == ["grasps: seed=0.parquet", "--seed 0 is given"]

@@ -307,3 +307,14 @@ def test_methods_of_before_are_taken_and_told() -> None:
 def test_a_further_column_of_three_axes_is_refused() -> None:
     with pytest.raises(ValueError, match=r"more than two axes: {'mine': \(2, 2, 3\)}"):
         make(2).replace(extra={"mine": torch.zeros(2, 2, 3)})
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.int16])
+def test_indices_of_any_size_choose(kind: type) -> None:
+    batch = make(2)
+    assert torch.equal(batch[np.array([1, 0], kind)].joints, batch.joints.flip(0))
+
+
+def test_other_poses_know_no_hold() -> None:
+    batch = make(2).replace(extra={"held_joints": torch.zeros(2, 1), "q1": torch.ones(2), "mine": torch.ones(2)})
+    assert set(batch.with_poses(batch.T_object_wrist, batch.joints).extra) == {"mine"}

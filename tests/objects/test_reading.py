@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import DroGraspError, ObjectError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import cloud_object, estimate_normals, load_file
+from dro_grasp.objects.reading import read_rows
 from dro_grasp.objects.shape import CLOUD_POINTS
 
 
@@ -396,3 +397,42 @@ def test_a_wrong_vertex_is_named(tmp_path: Path) -> None:
     for wrong in (-1, 3):
         with pytest.raises(ObjectError, match=rf"a face with vertex {wrong}, and vertices 0 to 2"):
             load_object((corners, np.array([[0, 1, wrong]])))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_normals_of_a_cloud_file_are_read_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+    points = CYLINDER.sample(400, seed=1)
+    normals = np.tile([0.0, 0.6, 0.8], (400, 1))
+    rows = np.column_stack([points, normals]).astype(np.float32)
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    head = f"ply\nformat {encoding} 1.0\nelement vertex 400\n{names}end_header\n".encode()
+    body = rows.astype("<f4").tobytes() if "binary" in encoding else "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    (tmp_path / "cloud.ply").write_bytes(head + body)
+    np.testing.assert_allclose(read_rows(tmp_path / "cloud.ply")[:, 3:], normals, atol=1e-6)
+
+
+def test_arrays_of_records_and_unknown_units_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "records.npy", np.zeros(2000, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
+    with pytest.raises(ObjectError, match="instead of numbers"):
+        load_object(tmp_path / "records.npy")
+    mesh = CYLINDER.copy()
+    mesh.units = "furlong"
+    with pytest.raises(ObjectError, match="its unit 'furlong' is unknown"):
+        load_object(mesh)
+
+
+def test_one_colour_for_all_points_is_no_normal() -> None:
+    points = CYLINDER.sample(1500, seed=2)
+    with pytest.raises(ObjectError, match="which are no normals"):
+        load_object(np.column_stack([points, np.full((1500, 3), 128.0)]))
+
+
+def test_an_inverted_body_counts_and_a_cavity_stays_one() -> None:
+    outer, other = trimesh.creation.box((0.06, 0.06, 0.06)), trimesh.creation.box((0.05, 0.05, 0.05))
+    other.invert()
+    inside = trimesh.util.concatenate([outer, other])
+    beside = trimesh.util.concatenate([outer, other.copy().apply_translation((0, 0, 0.056))])
+    assert load_object(inside).volume == pytest.approx(0.06**3 - 0.05**3, rel=1e-3)
+    found = load_object(beside)
+    assert found.volume == pytest.approx(0.06**3 + 0.05**3, rel=1e-3)
+    assert 0 < found.centre_of_mass[2] < 0.03

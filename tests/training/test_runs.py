@@ -463,3 +463,10 @@ def test_a_line_now_and_then_with_the_time_that_is_left(
     assert [line.split()[1] for line in lines] == ["10/100", "40/100", "100/100"], "not within ten seconds, but at the end"
     assert lines[1].endswith("  2 min left"), "three tenths took a minute, so the other six take two"
     assert "total 0.5000" in lines[0]
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_out_of_range_is_refused(seed: int) -> None:
+    with pytest.raises(OptionError, match=rf"seed is {seed}; give an integer from 0 to 2\^63 - 1"):
+        check_schedule(dataclasses.replace(SCHEDULE, seed=seed))
+    check_schedule(dataclasses.replace(SCHEDULE, seed=2**62))

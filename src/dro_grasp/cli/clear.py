@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from dro_grasp.cli.inputs import Flag, Friction, optional
-from dro_grasp.cli.output import print_json, print_table, say, say_aside
+from dro_grasp.cli.output import print_json, print_table, say, say_aside, say_file
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import UNTYPED, check_output, reading, replacing
@@ -73,6 +73,8 @@ class Clear:
             check_output(self.output, ".jsonl")
         if self.record is not None:
             check_output(self.record, ".npz")
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         names = resolve_objects(list(self.objects))
         count = len(names) if self.things is None else self.things
         if self.tables < 1 or not 1 <= count <= len(names):
@@ -84,11 +86,12 @@ class Clear:
                "seed": self.seed, "weights": describe_weights(self.weights)["sha256"], "settings": asdict(config)}
         known = _read(self.output, json.loads(json.dumps(key)))
         predictor = GraspPredictor(self.weights)
-        done = list[dict[str, Any]]()
+        done, first = list[dict[str, Any]](), None
         for number in range(self.tables):
             kept = number == 0 and (self.video is not None or self.record is not None)
             if number not in known or kept:
                 recorder = ClearRecorder() if kept else None
+                first = first or recorder
 
                 def picked(pick: Pick, recorder: ClearRecorder | None = recorder) -> None:
                     if recorder is not None:
@@ -100,10 +103,10 @@ class Clear:
                 made = clear_trial(robot, drawn, number, self.seed, predictor, config, recorder, picked)
                 known[number] = asdict(made)
                 _append(self.output, {"table": number, **asdict(made), "key": key})
-                if recorder is not None:
-                    self._keep(robot, recorder)
             done.append(known[number])
         self._report(done)
+        if first is not None:
+            self._keep(robot, first)
         return 0
 
     def _config(self) -> ClearTrialConfig:
@@ -124,7 +127,7 @@ class Clear:
             say_aside(f"record: {self.record} (dro-grasp view {self.record} plays it)")
         if self.video is not None:
             draw_animation(robot, replace(recorder, frames=recorder.frames[::VIDEO_EVERY]), self.video)
-            say_aside(f"video: {self.video}")
+            say_file("video", self.video, aside=True)
 
     def _report(self, done: list[dict[str, Any]]) -> None:
         from dro_grasp.compare.metrics import wilson_interval
@@ -151,7 +154,7 @@ class Clear:
             say(f"whether it holds: {right} of {len(judged)} judgements are right ({right / len(judged):.0%}, 95 % interval "
                 f"{low:.0%} to {high:.0%})")
         if self.output is not None:
-            say(f"tables: {self.output}")
+            say_file("tables", self.output)
 
 
 def _drawn(total: int, count: int, seed: int, number: int) -> list[int]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from dro_grasp.cli.given_scene import check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
-from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside, say_file
 from dro_grasp.cli.remote import generate_at, server_of
 from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
@@ -337,7 +338,7 @@ class Generate:
             say(line)
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
-                say(f"{what}: {report[key]}")
+                say_file(what, report[key])
 
 
 class Ready(NamedTuple):
@@ -391,6 +392,9 @@ def paths_per_object(path: Path | None, names: list[str], several: bool, suffix:
     path = check_folder(path)
     stems = [Path(name).stem for name in names]
     # mug.obj and mug.ply would overwrite each other's results.
-    labels = [Path(n).name.replace(".", "_") if stems.count(s) > 1 else s for n, s in zip(names, stems, strict=True)]
+    labels = list[str]()
+    for name, stem in zip(names, stems, strict=True):
+        own = Path(name).name.replace(".", "_") if stems.count(stem) > 1 else stem
+        labels.append(next(each for each in chain([own], (f"{own}-{k}" for k in count(2))) if each not in labels))
     files = (path / f"{label}{suffix}" for label in labels)
     return [check_output(file) if path.is_dir() else file for file in files]

@@ -12,7 +12,7 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.listing import Hands
-from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say
+from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say, say_file
 from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.files import check_output, command, make_folder, reading, replacing
 
@@ -86,7 +86,7 @@ class Make:
         told = ", ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
         say(f"{len(made)} hands in {self.output}; {reasons.total()} plans were drawn again{': ' if told else ''}{told}")
         if self.picture is not None:
-            say(f"picture: {self.picture}")
+            say_file("picture", self.picture)
 
 
 def _listing(path: Path) -> dict[str, dict[str, Any]]:

@@ -28,6 +28,11 @@ def say(text: str) -> None:
     stdout.print(in_switches(text), soft_wrap=True)
 
 
+def say_file(what: str, path: object, aside: bool = False) -> None:
+    """Print where a file is, on stdout or on stderr; a name that reads like an option stays as it is."""
+    (stderr if aside else stdout).print(f"{what}: {path}", soft_wrap=True)
+
+
 def say_aside(text: str) -> None:
     """Print one line to stderr without wrapping."""
     stderr.print(in_switches(text), soft_wrap=True)
@@ -65,8 +70,10 @@ def print_report(report: Any, picture: Path | None, as_json: bool) -> None:
     if as_json:
         print_json({**report.to_dict(), "picture": None if picture is None else str(picture)})
         return
-    for line in [*report.lines(), *([] if picture is None else [f"picture: {picture}"])]:
+    for line in report.lines():
         say(line)
+    if picture is not None:
+        say_file("picture", picture)
 
 
 def records(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[dict[str, Any]]:

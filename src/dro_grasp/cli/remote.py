@@ -7,6 +7,7 @@ import json
 import os
 import struct
 import time
+import uuid
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +102,7 @@ def call_of(command: Generate) -> dict[str, Any]:
         "obstacles": None if command.obstacles is None else sent_object(command.obstacles) | {"scale": command.scale},
         "camera": None if command.camera is None else sent_camera(command.camera),
         "path": str(file.resolve()) if file.is_file() else None,
+        "id": uuid.uuid4().hex,  # by which a busy server keeps its turn
     }
 
 

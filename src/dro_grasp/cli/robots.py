@@ -11,7 +11,7 @@ import tyro
 
 from dro_grasp.cli.given_scene import check_choice, find_on_table
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, load_obstacle, optional
-from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
+from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside, say_file
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, given_path, replacing
@@ -156,8 +156,10 @@ class Plan:
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
             return 0
-        for line in [*made.lines(), *(f"{what}: {path}" for what, path in written.items())]:
+        for line in made.lines():
             say(line)
+        for what, path in written.items():
+            say_file(what, path)
         return 0
 
     def _write(self, made: MotionPlan, robot: Robot) -> dict[str, str]:
@@ -304,7 +306,7 @@ class Tabletop:
         self._report(done)
         if self.video is not None:
             draw_attempt(run, self.video)
-            say_aside(f"video: {self.video}")
+            say_file("video", self.video, aside=True)
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
@@ -338,7 +340,7 @@ class Tabletop:
             say(f"depth image to timed plan, time of one core: median {seconds['median']:.1f} s, 95 % within "
                 f"{seconds['within_95']:.1f} s (n = {seconds['n']})")
         if self.output is not None:
-            say(f"attempts: {self.output}")
+            say_file("attempts", self.output)
 
 
 def _say(attempt: Attempt) -> None:

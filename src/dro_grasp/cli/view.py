@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import say
+from dro_grasp.cli.output import say_file
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output
@@ -75,7 +75,14 @@ class View:
 
             (show or serve)(StudioServer(self._of_scene(self.scene), self.port, self.host, token))
             return 0
-        if self.file is not None and is_motion(self.file):
+        motion = self.file is not None and is_motion(self.file)
+        idle = {"--hand": self.hand, "--object": self.object} if motion else {
+            "--robot": self.robot, "--attempt": self.attempt or None}
+        if given := [option for option, value in idle.items() if value is not None]:
+            raise OptionError(f"{' and '.join(given)} {'are' if given[1:] else 'is'} for "
+                              + ("grasps, and the file holds a motion" if motion else "motions of an arm, or for --scene")
+                              + "; leave it out")
+        if self.file is not None and motion:
             require_extra("arm")
             from dro_grasp.apps.viewer.clear_page import clear_page
             from dro_grasp.apps.viewer.lift_page import lift_page
@@ -133,7 +140,7 @@ class View:
             scene = load_scene(file, scale=self.scale, camera=camera)
             made = partial(RobotScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, robot=robot)
         _ = scene.segments  # refused before a browser comes
-        return lambda client, turn: made(client, turn=turn)
+        return lambda client, turn: made(client, turn=turn, camera=camera)
 
     def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:
         """What makes a page that shows the grasps of a file."""
@@ -213,7 +220,7 @@ class Picture:
                               f"sheet has at most {MAX_PIXELS // 10**6} million: give a smaller --size or --count")
         style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
         draw_sheet(hand, pairs, self.output, self.columns, style)
-        say(f"picture: {self.output}")
+        say_file("picture", self.output)
         return 0
 
     def pairs(self, grasps: GraspBatch) -> list[tuple[ObjectModel, GraspBatch]]:

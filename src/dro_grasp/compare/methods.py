@@ -84,7 +84,7 @@ class Method:
 
     def predict(self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0) -> GraspBatch:
         """Grasps as `GraspPredictor.predict` returns them: at most `num`, the same for the same seed."""
-        return self.returned(GraspProblem(hand, obj), num, seed).grasps.with_asked(self.asked(obj, num))
+        return self.returned(GraspProblem(hand, obj, self.predictor.device), num, seed).grasps.with_asked(self.asked(obj, num))
 
 
 def make_method(name: str, options: MethodOptions | None = None) -> Method:

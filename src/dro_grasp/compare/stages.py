@@ -257,4 +257,8 @@ def finished_maker(problem: GraspProblem, method: Method, keep: int) -> Maker:
 
 
 def _best(grasps: GraspBatch, keep: int) -> GraspBatch:
+    """The best by score, each once: sources of stored grasps give the same ones again."""
+    rows = torch.cat([grasps.T_object_wrist.flatten(1), grasps.joints], 1)
+    first = {row.numpy().tobytes(): i for i, row in reversed(list(enumerate(rows)))}
+    grasps = grasps[sorted(first.values())]
     return grasps[grasps.score.topk(min(keep, len(grasps))).indices]

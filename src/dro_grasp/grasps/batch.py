@@ -276,7 +276,7 @@ class GraspBatch:
 
     def with_poses(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> GraspBatch:
         """The batch at other poses and joints; everything that belongs to the poses before is unknown or gone."""
-        stale = [name for name in self.extra if name == columns.DEPTH or name.startswith(columns.ENERGY_TERM)]
+        stale = [name for name in self.extra if name in columns.OF_POSES or name.startswith(columns.ENERGY_TERM)]
         rest = self.without(*columns.MAY_BE_UNKNOWN, *stale).without_trial()
         return rest.replace(T_object_wrist=T_object_wrist, joints=joints)
 

@@ -54,6 +54,12 @@ ENERGY_TERM = "energy_"  # How the names of further columns with the terms of th
 Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the name and hash of their object
 
 
+OF_POSES = frozenset({
+    DEPTH, "held_joints", "held_torque", "empty_joints", "empty_torque", "hold_unit", "held_weight", "object_penetration",
+    "deepest_self_penetration", "touching_links", "contact_distance", "contact_spread", "q1", "wrench_error"})
+"""Further columns that belong to a pose and joints: depth, what to expect of a hold, and measures of contact."""
+
+
 def require_fit(batch: Any, n_names: int) -> None:
     """Refuse columns of a batch that do not fit together: ValueError."""
     every, n = {name: getattr(batch, name) for name in COLUMNS} | batch.extra, len(batch)
@@ -118,6 +124,7 @@ def rows_at(index: Any, n: int) -> Int[Tensor, " k"]:
     if chosen is None or chosen.is_floating_point() or chosen.is_complex() or (mask and chosen.ndim != 1):
         raise OptionError(f"{str(index)[:MAX_QUOTED_CHARS]} chooses no grasps; give an index, a slice, a list of indices, or a "
                           "mask with one truth value a grasp")
+    chosen = chosen if mask else chosen.long()
     if (not mask and bool(((chosen < -n) | (chosen >= n)).any())) or (mask and len(chosen) != n):
         raise IndexError(f"mask of {len(chosen)} for a batch of {n}" if mask else f"grasp {index} of a batch of {n}")
     return torch.arange(n)[chosen].reshape(-1)

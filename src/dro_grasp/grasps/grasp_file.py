@@ -372,7 +372,8 @@ def _decode_further(column: pa.ChunkedArray) -> Any:
         return floats(column, None, "extra")
     if column.null_count == 0 and (pa.types.is_boolean(kind) or pa.types.is_integer(kind)):
         return torch.tensor(column.to_pylist())
-    if pa.types.is_list(kind) and pa.types.is_floating(kind.value_type):
+    lists = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    if lists and pa.types.is_floating(kind.value_type):
         lengths = {len(v) for v in column.to_pylist() if v is not None}
         if len(lengths) == 1:
             return floats(column, lengths.pop(), "extra")

@@ -71,7 +71,10 @@ class HoldExpectation:
                 f"index is {index}; give one from {-len(grasps)} to {len(grasps) - 1}: the batch has {len(grasps)} grasps")
         if not all(name in grasps.extra for name in HOLD_COLUMNS):
             return None
-        rows = [grasps.extra[name][index].double().numpy() for name in HOLD_COLUMNS]
+        values = [grasps.extra[name][index] for name in HOLD_COLUMNS]
+        if any(value is None for value in values):
+            return None
+        rows = [np.asarray(value, np.float64) for value in values]
         weight = float(grasps.extra[WEIGHT_COLUMN][index]) if WEIGHT_COLUMN in grasps.extra else math.nan
         known = weight if math.isfinite(weight) else None
         return HoldExpectation(*rows, weight=known) if all(np.isfinite(row).all() for row in rows) else None

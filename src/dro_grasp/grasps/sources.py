@@ -170,7 +170,9 @@ def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
     source = _recorded(grasps, OBJECT_FILE)
     if source and OBJECT_SCALE in grasps.extra:
-        scale = _as_given(grasps.extra[OBJECT_SCALE][0])
+        known = grasps.extra[OBJECT_SCALE]
+        known = known[known.isfinite()]
+        scale = _as_given(known[0]) if len(known) else scale
     return source or grasps.object[0], scale
 
 

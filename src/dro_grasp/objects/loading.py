@@ -162,6 +162,8 @@ def given_normals(
         return None, ()
     length = np.linalg.norm(given, axis=1, keepdims=True)
     unit = bool(np.isfinite(length).all()) and length.min() > 1e-6 and length.max() < 1.2 * length.min()  # (ours)
+    if unit and abs(float(length.mean()) - 1) > 0.2:  # one vector for all points, and no unit vector, is a colour
+        unit = float(np.linalg.norm((given / length).mean(0))) < ONE_COLOUR
     if not unit and not named and length.min() > 1e-6:  # something else, such as colours
         raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
                           "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
@@ -275,6 +277,7 @@ def _scale_hint(largest: float, origin: str) -> str:
     return "; ".join(f"scale={scale:g} for {unit}, which makes it {largest * scale * 100:.3g} cm" for unit, scale in fits)
 
 
+ONE_COLOUR = 0.999  # Length of the mean of unit vectors from which on they are one vector for all points [1] (ours)
 LEAST_FILL = 1e-3
 """Share of its bounding box that a hull must fill, and share of its hull that a closed mesh must fill (ours); less is a
 sheet."""
@@ -391,6 +394,7 @@ def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
 def _turn_outward(mesh: trimesh.Trimesh) -> bool:
     """Make all faces counter-clockwise from outside; returns whether any was turned."""
     before = np.array(mesh.faces)
+    _turn_bodies(mesh)
     if not mesh.is_winding_consistent or (mesh.is_watertight and _volume(mesh) < 0):
         with np.errstate(invalid="ignore", divide="ignore"):  # flat bodies have no centre of mass
             trimesh.repair.fix_normals(mesh, multibody=True)
@@ -398,6 +402,23 @@ def _turn_outward(mesh: trimesh.Trimesh) -> bool:
         # The volume of an open mesh depends on the origin, so it cannot tell inside from outside.
         mesh.invert()
     return not np.array_equal(before, mesh.faces)
+
+
+def _turn_bodies(mesh: trimesh.Trimesh) -> None:
+    """Turn inverted bodies that are no cavities of others: their volume would count against that of the others."""
+    import igl
+
+    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.body_count > 1):
+        return
+    faces, vertices = np.array(mesh.faces, np.int64), np.ascontiguousarray(mesh.vertices, np.float64)
+    for body in trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1):
+        if enclosed_volume(mesh.triangles[body]) < 0:
+            around = np.abs(igl.fast_winding_number(
+                vertices, np.ascontiguousarray(np.delete(faces, body, 0)), vertices[np.unique(faces[body])]))
+            if float(around.mean()) < 0.5:
+                faces[body] = faces[body][:, ::-1]
+    if not np.array_equal(faces, mesh.faces):
+        mesh.faces = faces
 
 
 def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:

@@ -103,14 +103,19 @@ def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
     points = np.asarray(cloud.vertices, np.float64)
     raw = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = ("nx", "ny", "nz")
-    if not isinstance(raw, dict) or any(name not in raw or len(raw[name]) != len(points) for name in names):
+    columns = raw if isinstance(raw, dict) else getattr(getattr(raw, "dtype", None), "names", None) or ()  # binary: an array
+    if any(name not in columns or len(raw[name]) != len(points) for name in names):
         return points
     return np.column_stack([points, *(np.asarray(raw[name], np.float64).reshape(len(points)) for name in names)])
 
 
 def in_metres(given: Any) -> Any:
     """One mesh or cloud, scenes merged, in metres where a unit is stated; what was given stays as it is."""
-    unit = trimesh.units.unit_conversion(given.units, "meters") if given.units else 1.0
+    try:
+        unit = trimesh.units.unit_conversion(given.units, "meters") if given.units else 1.0
+    except (KeyError, ValueError) as error:
+        raise ObjectError(f"its unit '{given.units}' is unknown; state 'meters' or 'millimeters' (units=...), or None and a "
+                          "scale") from error
     geometry = merge_scene(given) if isinstance(given, trimesh.Scene) else given
     return geometry if unit == 1.0 else geometry.copy().apply_scale(unit)
 
@@ -165,6 +170,8 @@ def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
                 raise ValueError(str(error)) from error
             if mapped.size > path.stat().st_size:  # entries of no size
                 raise ValueError(f"its header promises {mapped.size} numbers")
+            if mapped.dtype.kind not in "biuf":
+                raise ValueError(f"it holds {mapped.dtype} instead of numbers")
             return np.array(mapped, np.float64)
     with reading(path, ObjectError, "a PCD file with x y z and all its points; it is damaged"):
         check_bytes(path)

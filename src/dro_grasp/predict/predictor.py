@@ -175,7 +175,8 @@ class GraspPredictor:
         for problem, made in zip(problems, self.run_many(problems, request), strict=True):
             if (shortage := str(made) if isinstance(made, NoGraspError) else made.shortage) is not None:
                 warnings.warn(shortage, stacklevel=2)
-            found.append(GraspBatch.none(hand, problem.obj) if isinstance(made, NoGraspError) else made.grasps)
+            none = GraspBatch.none(hand, problem.obj).replace(asked_of={(problem.obj.name, problem.obj.sha256): num})
+            found.append(none if isinstance(made, NoGraspError) else made.grasps)
         return found
 
     def run(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Prediction:
@@ -225,7 +226,7 @@ class GraspPredictor:
 
     @torch.no_grad()
     def rounds(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Iterator[GraspBatch]:
-        """Grasps as they become known: after each round in which sources were asked, what is new and would be returned so far.
+        """Grasps as they become known: after each round in which sources were asked, the best of what was not yielded yet.
 
         For those who need one good grasp soon and know by themselves which is: who has it asks for no further round. Arguments
         and errors are those of `run`; where nothing is found at all, no batch comes before the error.

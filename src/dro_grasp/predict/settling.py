@@ -229,7 +229,7 @@ def settle_all(
     config = config or SettleConfig()
     whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
         problems, batches, strict=True)]
-    hanging = [i for i, problem in enumerate(problems) if not problem.lies_flat]
+    hanging = [i for i, problem in enumerate(problems) if not problem.lies_flat or not len(batches[i])]
     done = dict(zip(hanging, _closed_thrice([problems[i] for i in hanging], [whole[i] for i in hanging], config), strict=True))
     return [done[i] if i in done else _lifted(problem, grasps, config)
             for i, (problem, grasps) in enumerate(zip(problems, whole, strict=True))]

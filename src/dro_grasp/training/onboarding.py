@@ -373,7 +373,7 @@ def _drawn(done: Onboarded) -> str:
     for name in resolve_objects(list(config.held_out))[: config.objects_drawn]:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
-        problem = GraspProblem(hand, obj)
+        problem = GraspProblem(hand, obj, predictor.device)
         made = predictor.run(problem, GraspRequest(asked, source=config.source))
         draw_grasps(hand, obj, evaluate(problem, made.grasps), path)
         by_optimiser, short = made.origin.count("optimiser"), ""

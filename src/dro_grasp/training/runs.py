@@ -380,7 +380,7 @@ class TrainingRun:
         self.generator.manual_seed(self._seed(self.step, shard))
 
     def _seed(self, step: int, shard: int) -> int:
-        return (self.schedule.seed * 1_000_003 + step) * 1_009 + shard
+        return ((self.schedule.seed * 1_000_003 + step) * 1_009 + shard) % 2**63
 
     def _computing(
         self, losses: Callable[..., Losses], draw: Callable[[torch.Generator], Any] | None
@@ -529,6 +529,8 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
 def check_schedule(schedule: ScheduleConfig) -> None:
     """Refuse a schedule that cannot be carried out here."""
     require_device(schedule.device)
+    if not 0 <= schedule.seed < 2**63:
+        raise OptionError(f"seed is {schedule.seed}; give an integer from 0 to 2^63 - 1")
     for name in ("steps", "minutes", "learning_rate", "log_every", "recalibration", "shards"):
         value = getattr(schedule, name)
         if value is not None and not 0 < value < math.inf:

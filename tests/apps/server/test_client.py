@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import dro_grasp as dro
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, ServerError
 
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
@@ -98,3 +98,9 @@ def test_what_cannot_be_sent_is_named(
 def test_a_choice_that_cannot_be_sent_is_refused(choose: Any, told: str) -> None:
     with pytest.raises(OptionError, match=told):
         dro.GraspClient("http://127.0.0.1:9").predict("allegro", CLOUD, choose=choose)
+
+
+@pytest.mark.parametrize("address", ["robot-pc", "127.0.0.1"])
+def test_an_address_that_is_none_is_told(address: str) -> None:
+    with pytest.raises(ServerError, match=r"no grasp server answers at .*; give http://HOST:PORT"):
+        dro.GraspClient(address).predict("allegro", "can")

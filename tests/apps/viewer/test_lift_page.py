@@ -180,3 +180,14 @@ def test_a_robot_with_other_joints_is_refused(
         recorder.record(robot).save(tmp_path / "m.npz")
         with pytest.raises(OptionError, match=r"and the record in .*m.npz"):
             clear_page(tmp_path / "m.npz", small_robot, port=free_port())
+
+
+def test_another_robot_of_the_same_name_is_refused(robot: dro.Robot, plan: dro.MotionPlan, tmp_path: Path) -> None:
+    T = robot.T_world_wrist(plan.arm.position[plan.part("approach").stop - 1])
+    same = replace(plan, notes=replace(plan.notes, T_world_wrist=T.tolist()))
+    same.save(tmp_path / "same.npz")
+    lift_page(tmp_path / "same.npz", port=free_port()).stop()
+    T[0, 3] += 0.02
+    replace(plan, notes=replace(plan.notes, T_world_wrist=T.tolist())).save(tmp_path / "other.npz")
+    with pytest.raises(OptionError, match=r"is not the one of the plan in .*other.npz: its wrist is elsewhere"):
+        lift_page(tmp_path / "other.npz", port=free_port())

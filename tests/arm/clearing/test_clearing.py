@@ -16,7 +16,7 @@ from dro_grasp.arm.clearing.trial import clear_trial
 from dro_grasp.arm.planning.motion import PLACING, STAGES, MotionPlan, Trajectory
 from dro_grasp.arm.planning.placing import Place
 from dro_grasp.arm.planning.workcell import CLEARANCE, Workcell
-from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.grasps.hold import HoldCheck
 
 SPOTS = {"a": (0.45, 0.1), "b": (0.5, -0.15)}
@@ -297,3 +297,11 @@ def test_a_can_is_cleared_from_a_table_in_simulation(robot: dro.Robot) -> None:
     assert (done.removed, done.fallen, done.reason) == ((True,), (False,), "")
     assert done.cleared.done == len(done.cleared.picks) == 1
     assert all(state == "held" and held for state, held in done.judgements)
+
+
+@pytest.mark.parametrize("seen", [np.zeros((0, 3)), np.zeros((50, 3)), np.full((50, 3), np.nan)], ids=["none", "zeros", "nan"])
+def test_a_blind_camera_has_not_seen_a_cleared_table(robot: dro.Robot, seen: np.ndarray) -> None:
+    rig = Table(robot, [])
+    rig.look = lambda: seen  # type: ignore[method-assign]
+    with pytest.raises(ObjectError):
+        clear_table(robot, rig, NOBODY)

@@ -276,7 +276,7 @@ def test_a_push_as_a_plan(narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPl
     assert again.notes.slide == made.notes.slide
     assert {row.split(",")[1] for row in dro.trajectory_csv(again).splitlines()[1:]} == set(SLIDING)
     assert "pushes object 'board'" in dro.trajectory_yaml(again)
-    assert [stage["name"] for stage in dro.task_stages(again, narrow)][-2:] == ["retreat", "look again"]
+    assert [stage["name"] for stage in dro.task_stages(again, narrow)][-3:] == ["retreat", "open again", "look again"]
     assert "then look again, and plan again" in made.lines()[0]
     film = Film.of_plan(narrow, again)
     assert np.array_equal(film.poses[0, 0], np.eye(4))

@@ -19,8 +19,8 @@ from dro_grasp.cli.remote import sent_camera
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.frames import read_motion
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.perception.scan import scanned_object
-from dro_grasp.objects.perception.scene_files import SceneCamera, as_camera
+from dro_grasp.objects.perception.scan import depth_points, scanned_object
+from dro_grasp.objects.perception.scene_files import SceneCamera, as_camera, read_mask
 from dro_grasp.objects.perception.segmentation import STRUCTURE
 from dro_grasp.objects.perception.taking import taken_object
 from dro_grasp.objects.scenery import load_scene
@@ -371,3 +371,25 @@ def test_scenes_of_a_millimetre_are_refused(tmp_path: Path) -> None:
     turned = points[:, [2, 0, 1]]  # x forward: many z are near 0
     assert load_scene(turned, camera=camera).sight is not None
     assert np.ptp(load_scene(np.array([[0.1, 0, 0], [0.102, 0, 0]])).points) > 0, "a speck in metres is one"
+
+
+def test_masks_are_what_is_seen_of_them(tmp_path: Path) -> None:
+    on = np.zeros((4, 6), bool)
+    on[1:3, 2:4] = True
+    label, clear = np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 4), 255, np.uint8)
+    label[on], clear[~on, 3] = (0, 0, 4), 0
+    for name, pixels in (("label", label), ("clear", clear), ("grey", on.astype(np.uint8))):
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), on)
+    K = [[5, 0, 2.5], [0, 5, 1.5], [0, 0, 1]]
+    points = depth_points(np.full((4, 6), 0.5), K, np.where(on, 1.0, np.nan))
+    assert len(points) == on.sum()
+
+
+def test_a_camera_of_lists_is_one_of_arrays() -> None:
+    made = make_scene("table", 1, 0, width=160)
+    K = np.asarray(made.camera.intrinsics)
+    camera = SceneCamera(np.eye(4).tolist(), K.tolist())  # type: ignore[arg-type]
+    assert load_scene(np.where(made.depth < 5, made.depth, 0.0), camera=camera).segments.count == 1
+    with pytest.raises(OptionError, match=r"intrinsics have shape \(3, 4\)"):
+        SceneCamera(np.eye(4), np.ones((3, 4)))

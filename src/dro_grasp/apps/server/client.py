@@ -8,13 +8,14 @@ import json
 import time
 import uuid
 from collections.abc import Mapping
+from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 from dro_grasp.errors import OptionError, ServerError
-from dro_grasp.files import given_path
+from dro_grasp.files import given_path, reason_of
 from dro_grasp.kinds import FORMER_CONSTRAINTS, checked, present
 
 if TYPE_CHECKING:
@@ -105,8 +106,9 @@ class GraspClient:
         except TimeoutError as error:
             raise ServerError(f"the grasp server at {self.url} gave no answer in {self.timeout:g} s; ask for fewer grasps, or "
                               "give GraspClient a longer timeout") from error
-        except (URLError, OSError) as error:
-            raise ServerError(f"no grasp server answers at {self.url} ({error}); start one with `dro-grasp serve`") from error
+        except (URLError, OSError, HTTPException, ValueError) as error:  # other programs answer in other ways
+            raise ServerError(f"no grasp server answers at {self.url} ({reason_of(error)}); give http://HOST:PORT, or start "
+                              "one with `dro-grasp serve`") from error
 
 
 def listed(value: Any) -> Any:

@@ -76,9 +76,8 @@ class ClearPage(ServedPage, Page):
 
     def _go(self) -> None:
         """Show the beginning of what was picked."""
-        self.film = None  # what plays stops
+        self.film = object()  # what plays stops
         self.moment.value = moment = self.starts[self.part.value]
-        self.film = self.record
         self.show_moment(moment)
 
     def show_moment(self, moment: int) -> None:
@@ -113,7 +112,7 @@ class ClearPage(ServedPage, Page):
         """Play from the moment that is shown, or from the start where that is the last one."""
         record, fast = self.record, float(self.speed.value.split()[0])
         first = int(self.moment.value) if int(self.moment.value) < len(record.arm) - 1 else 0
-        self.film = film = record if self.film is None else self.film
+        self.film = film = object()
         self._roll(film, len(record.arm), 1 / (record.rate * fast), first)
 
 

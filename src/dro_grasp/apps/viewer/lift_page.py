@@ -12,7 +12,7 @@ import viser
 
 from dro_grasp.apps.viewer.film import RATE, Film
 from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
-from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
+from dro_grasp.apps.viewer.scene_view import HOST, PATIENCE, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
@@ -28,6 +28,8 @@ from dro_grasp.predict.predictor import GraspPredictor
 
 DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)  # Grey of grasps that were dropped
 WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)  # Yellow of grasps that were not tried
+ELSEWHERE = 5e-3  # Distance of wrists that are not the same [m] (ours)
+TURNED = 1e-2  # Difference of their rotation matrices [1] (ours)
 NONE = "none"  # Choice of no grasps
 EVERY = "all"  # Choice of every grasp
 
@@ -70,9 +72,9 @@ class LiftPage(ServedPage, Page):
         gui = self.server.gui
         self.name = gui.add_markdown("")
         if self.attempts:
-            labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
-            self.picked = gui.add_dropdown("Attempt", labels, initial_value=labels[0])
-            self.picked.on_update(lambda _: self._guarded(lambda: self.repeat(labels.index(self.picked.value))))
+            self.labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
+            self.picked = gui.add_dropdown("Attempt", self.labels, initial_value=self.labels[0])
+            self.picked.on_update(lambda event: None if event.client is None else self._pick())
         self._add_player("Play")
         self.cloud = gui.add_checkbox("Camera's cloud", True, hint="What was planned for, its unseen side estimated.")
         self.shapes = gui.add_checkbox("Objects", True, hint="As they were simulated.", disabled=not self.attempts)
@@ -81,6 +83,11 @@ class LiftPage(ServedPage, Page):
         self.text = self.status = gui.add_markdown("")
         for choice in (self.cloud, self.shapes, self.grasps):
             choice.on_update(lambda _: self._show_layers())
+
+    def _pick(self) -> None:
+        """Repeat the attempt that was picked, once what plays has stopped."""
+        self.film = None
+        self._guarded(lambda: self.repeat(self.labels.index(self.picked.value)), PATIENCE)
 
     def repeat(self, index: int) -> None:
         """Run a stored attempt once more with its own robot and weights, and show it, and what of these has changed since.
@@ -91,7 +98,7 @@ class LiftPage(ServedPage, Page):
         """
         if not 0 <= index < len(self.attempts):
             raise OptionError(f"attempt is {index}; give one of 0 to {len(self.attempts) - 1}")
-        stored, recorder = self.attempts[index], Recorder(RATE)
+        stored, recorder, self.picked.value = self.attempts[index], Recorder(RATE), self.labels[index]
         config = TabletopConfig.from_label(stored.settings)
         self.text.content = f"Running attempt {index} once more: seeing, planning, lifting ..."
         same = stored.robot_sha256 == self.robot.sha256
@@ -180,6 +187,17 @@ class LiftPage(ServedPage, Page):
         self.view.aim(Camera.around(points, VIEW, aspect=4 / 3))
 
 
+def _require_same(robot: Robot, plan: MotionPlan, file: Path) -> None:
+    """Refuse a robot whose wrist is elsewhere in the grasp than that of the plan, by an OptionError."""
+    row = plan.part("press" if plan.notes.slide is not None else "approach").stop - 1
+    planned, own = (T @ robot.T_wrist_aim for T in (
+        np.array(plan.notes.T_world_wrist), robot.T_world_wrist(plan.arm.position[row])))
+    far = np.linalg.norm(own[:3, 3] - planned[:3, 3]) > ELSEWHERE
+    if far or (not robot.has_few_joints and np.abs(own[:3, :3] - planned[:3, :3]).max() > TURNED):
+        raise OptionError(f"robot '{robot.name}' is not the one of the plan in {file}: its wrist is elsewhere; give the file "
+                          "of that robot (robot=...)")
+
+
 def lift_page(
     file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST,
     make: Callable[..., Attempt] = attempt, token: str | None = None,
@@ -192,6 +210,7 @@ def lift_page(
         plan = MotionPlan.load(file)
         own = load_robot(robot or plan.notes.robot)
         require_joints(own, len(plan.notes.arm_joints), len(plan.notes.hand_joints), f"the plan in {file}")
+        _require_same(own, plan, file)
         page = LiftPage(own, (), weights, port, host, token=token)
         page.show(Film.of_plan(page.robot, plan))
         return page
@@ -202,5 +221,6 @@ def lift_page(
         attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
     first = load_robot(attempts[chosen].robot_file or attempts[chosen].robot)
     page = LiftPage(first, attempts, weights, port, host, make, token)
-    page.repeat(chosen)
+    with page._busy:  # a browser may be there already
+        page.repeat(chosen)
     return page

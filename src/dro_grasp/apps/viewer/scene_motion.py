@@ -30,6 +30,7 @@ from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.perception.segmentation import STRUCTURE
 from dro_grasp.objects.scenery import THIN, FoundObject, Scene
 from dro_grasp.objects.shape import ObjectModel
@@ -51,14 +52,15 @@ class RobotScenePage(ScenePage):
     steps = "1. Click a thing. &nbsp; 2. Choose a grasp. &nbsp; 3. Click the table, plan, play."
 
     def __init__(
-        self, client: Client, predictor: GraspPredictor, scene: Scene, robot: Robot, turn: threading.Lock | None = None
+        self, client: Client, predictor: GraspPredictor, scene: Scene, robot: Robot, turn: threading.Lock | None = None,
+        camera: SceneCamera | Path | str | None = None,
     ) -> None:
         """Show a scene, in the robot's world frame, with the robot at home; further arguments as for `ScenePage`."""
         self.robot = robot
         self.made: MotionPlan | None = None
         self.robot_view = RobotView(client, table=False)
         self.robot_view.put(robot)
-        super().__init__(client, predictor, scene, robot.hand, turn)
+        super().__init__(client, predictor, scene, robot.hand, turn, camera)
 
     def _add_motion(self) -> None:
         gui = self.client.gui

@@ -19,12 +19,13 @@ from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES
 from dro_grasp.apps.viewer.grasp_page import GRASP_FILE, exported
 from dro_grasp.apps.viewer.hand_view import GraspMarks, HandView, colour_of
 from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud
-from dro_grasp.apps.viewer.scene_view import Client, Closed, Page, escaped, rgb
+from dro_grasp.apps.viewer.scene_view import PATIENCE, Client, Closed, Page, escaped, rgb
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.forces import known
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.perception.segmentation import STRUCTURE
 from dro_grasp.objects.perception.things import place_of, size_of
 from dro_grasp.objects.scenery import FoundObject, Scene, load_scene
@@ -42,7 +43,6 @@ AROUND = 0.06  # Margin of a thing in the view of its grasps [m] (ours)
 LISTED = 6  # Grasps in the table (ours)
 UPRIGHT = 0.999  # Cosine of the scene's upward direction to z below which browsers have to turn the world first (ours)
 TURNING = 1.5  # Time that browsers get for that, since they place the camera in the world as it is turned then [s] (ours)
-PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 HAND_OVER = 0.3  # Time that work which ends has to take up what was asked for meanwhile [s] (ours)
 STEEP = 0.8  # Cosine of a palm to the vertical from which on it looks from above [1] (ours)
 FLAT = 0.4  # The same up to which it looks from the side [1] (ours)
@@ -97,11 +97,13 @@ class ScenePage(Page):
     steps = "1. Click a thing. &nbsp; 2. Look at its grasps, the surest first."
 
     def __init__(
-        self, client: Client, predictor: GraspPredictor, scene: Scene, hand: Hand, turn: threading.Lock | None = None
+        self, client: Client, predictor: GraspPredictor, scene: Scene, hand: Hand, turn: threading.Lock | None = None,
+        camera: SceneCamera | Path | str | None = None,
     ) -> None:
         """Show a scene.
 
         Args:
+            camera: What sees the scenes that are uploaded, until another camera is.
             turn: Held while grasps are made, for pages that share a machine; the predictor may be shared too.
 
         Raises:
@@ -109,7 +111,7 @@ class ScenePage(Page):
         """
         super().__init__(client)
         self.predictor, self.hand, self.library = predictor, hand, Library()
-        self._turn = turn or threading.Lock()
+        self._turn, self._camera = turn or threading.Lock(), camera
         self._wish: Wish | None = None
         self._answered: Wish | None = None
         self.offer: Offer | None = None
@@ -150,7 +152,6 @@ class ScenePage(Page):
         self.grasp.on_update(lambda event: None if event.client is None else self._show())
         self.again.on_click(lambda _: self._other())
         self.download.on_click(lambda event: self._guarded(lambda: self._send(event)))
-        self._camera: Path | None = None
         camera.on_upload(lambda _: self._guarded(lambda: self._take_camera(camera.value)))
         upload.on_upload(lambda _: self._take_scene(upload.value))
 

@@ -45,6 +45,7 @@ CAMERA_DISTANCE = 1.15  # Initial camera distance, as a multiple of that of a pi
 ASPECT = 4 / 3  # Width over height of a window from which on nothing is cut off
 NARROW = 1.0  # Width over height of a window below which the panel covers its lower half, as on a phone
 RAISED = 0.27  # Share of its height by which hand and object then stand above the middle (ours)
+PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does [s] (ours)
 GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 

@@ -23,7 +23,7 @@ from dro_grasp.arm.planning.trajectory import SPACING, densified, free_motion, s
 from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object, seen_on_table
-from dro_grasp.errors import DroGraspError, ObjectError, OptionError, PlanError
+from dro_grasp.errors import DroGraspError, OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked, checked
@@ -154,6 +154,7 @@ def clear_table(
         OptionError: The robot has no table or no camera, or does not reach the bin.
         RobotError: It collides where it stands.
         PlanError: The arm does not find its way home.
+        ObjectError: The camera sees nothing, or nothing of the table.
     """
     config, predictor = config or ClearConfig(), predictor or GraspPredictor()
     robot.require_table()
@@ -189,7 +190,7 @@ class _Look(NamedTuple):
     """What the camera sees outside the bin."""
 
     points: Float[np.ndarray, "n 3"]  # in the world [m]
-    scene: Scene | None  # None where there is nothing
+    scene: Scene
     spots: dict[tuple[float, float], Float[np.ndarray, "3"]]
     """A point of each thing, by the middle of what was seen of it [m]; those that have most room come first."""
 
@@ -200,10 +201,7 @@ def _look(robot: Robot, rig: Rig, bin: Bin) -> _Look:
     T, points = robot.camera.T_world_camera, rig.look()
     world = points @ T[:3, :3].T + T[:3, 3]
     outside = ~bin.holds(world, BESIDE)
-    try:
-        scene = seen_on_table(load_scene(points[outside], "thing", camera=robot.camera.as_seen()), robot)
-    except ObjectError:
-        return _Look(world[outside], None, {})
+    scene = seen_on_table(load_scene(points[outside], "thing", camera=robot.camera.as_seen()), robot)
     seen, labels = scene.points_seen(), scene.segments.labels
     places = np.array([seen[labels == k, :2].mean(0) for k in range(scene.segments.count)]).reshape(-1, 2)
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
@@ -219,7 +217,6 @@ def _pick(
 
     Grasps near those to avoid are not tried again, and then, or where there is no plan for it all, its parts are.
     """
-    assert look.scene is not None  # where something was seen
     try:
         seen = pick_object(look.scene, robot, look.spots[place])
     except DroGraspError as error:

@@ -16,7 +16,7 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.camera_view import depth_image
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher
 from dro_grasp.arm.tabletop.table_setup import Region, scatter
-from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.grasps.hold import HoldCheck
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.perception.depth_noise import NoiseName
@@ -135,7 +135,7 @@ def clear_trial(
 
     try:
         cleared = clear_table(robot, rig, predictor, config.clear, seed + 1000 * number, picked, judged)
-    except PlanError as error:  # as on a robot, a person has to help; what is removed counts
+    except (ObjectError, PlanError) as error:  # as on a robot, a person has to help; what is removed counts
         cleared, reason = Cleared(tuple(picks), ()), str(error)
     scene.advance(1.0)
     centres = [(T[:3, :3] @ obj.centre_of_mass + T[:3, 3])[None] for i, obj in enumerate(objects) for T in [scene.pose(i)]]

@@ -242,7 +242,9 @@ class MotionPlan:
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in self.stages)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
         if n.slide is not None:
-            return [f"no grasp of it is trusted: it is pushed by {100 * np.hypot(n.slide[0][3], n.slide[1][3]):.0f} cm to the "
+            T, middle = np.array(n.slide), self.scene.points.mean(0)
+            way = T[:3, :3] @ middle + T[:3, 3] - middle  # it may turn as well
+            return [f"no grasp of it is trusted: it is pushed by {100 * np.hypot(*way[:2]):.0f} cm to the "
                     "table's edge; then look again, and plan again",
                     f"motion of {self.seconds:.1f} s: {spans}"]
         sure = "" if n.rehearsed is None else f", held in {100 * n.rehearsed:.0f} % of its rehearsed lifts"

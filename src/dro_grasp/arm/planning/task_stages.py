@@ -37,7 +37,8 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
     stages = [shaped("open", "reach"), _pose("reach", plan, robot), shaped("shape", "shape"),
               {"name": "hand may touch", "type": "ModifyPlanningScene", "allow_collisions": touching}]
     if plan.notes.slide is not None:
-        stages += [*ways("approach", "press", "slide", "retreat"), _pose("look again", plan, robot)]
+        stages += [*ways("approach", "press", "slide", "retreat"), shaped("open again", "look again"),
+                   _pose("look again", plan, robot)]
     else:
         stages += [
             *ways("approach"), _joints("close", hand, plan.squeeze, plan.notes.squeeze_torque) | _expected(plan, hand),
@@ -45,7 +46,8 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
     if plan.notes.place is not None:
         stages += [
             _pose("carry", plan, robot), *ways("lower"), shaped("release", "release"),
-            {"name": "detach", "type": "ModifyPlanningScene", "detach_objects": held}, *ways("retreat")]
+            {"name": "detach", "type": "ModifyPlanningScene", "detach_objects": held}, *ways("retreat"),
+            shaped("open again", "retreat")]
     return [{"name": "current state", "type": "CurrentState"}, *(stage | {"frame": plan.notes.frame} for stage in stages)]
 
 

@@ -54,6 +54,10 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
         states = [read_state(srdf, name) if os.path.isfile(srdf) else {} for name in (OPEN, CLOSED)]
+        known = {joint.get("name") for joint in root.iter("joint")}
+        notes.extend(Note("warning", joint, f"is in the posture '{state}' of {srdf.name}, and no joint is called so; correct "
+                          "the name") for state, posture in zip((OPEN, CLOSED), states, strict=True)
+                     for joint in posture if joint not in known and link is None)
         files = (*files, srdf) if any(states) else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
@@ -246,8 +250,8 @@ def read_state(srdf: Path, name: str) -> dict[str, float]:
 
 
 def read_key(spec: mujoco.MjSpec, name: str) -> dict[str, float]:
-    """Joint values of the keyframe of this name in an MJCF [rad or m]; empty if it has none."""
-    if not any(key.name == name for key in spec.keys):
+    """Joint values of the keyframe of this name in an MJCF [rad or m]; empty if it has none, or states controls alone."""
+    if not any(key.name == name and (len(key.qpos) or not len(key.ctrl)) for key in spec.keys):
         return {}
     model = compiled(spec.copy(), [])
     values = model.key_qpos[model.key(name).id]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import HandError
-from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
+from dro_grasp.hands.description.compiling import MAX_JOINTS, MAX_LENGTH, MAX_TURN, Note, compile_hand
 from dro_grasp.hands.description.tendon_limits import tie_by_limits
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
@@ -58,6 +58,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     hand.pos, hand.quat, hand.mocap = [0, 0, 0], [1, 0, 0, 0], False
     # A rotation stated as Euler angles or axes would take precedence over the quaternion.
     hand.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    hand.set_frame(spec.worldbody.add_frame())  # one around the hand would move it as well
     for joint in list(hand.joints):
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
@@ -116,7 +117,7 @@ def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[
         if list(body.joints)[-1] != ball:
             raise HandError(f"{path}: joint '{name}' is a ball joint before another joint of link '{body.name}'; expected "
                             "it last, or three hinges")
-        limit = float(ball.range[1]) or (math.degrees(BALL_LIMIT) if spec.compiler.degree else BALL_LIMIT)
+        limit = float(ball.range[1]) or (math.degrees(BALL_LIMIT) if ball.compiler.degree else BALL_LIMIT)
         stated = {"pos": ball.pos.copy(), "stiffness": ball.stiffness, "range": [-limit, limit],
                   "actfrclimited": ball.actfrclimited, "actfrcrange": ball.actfrcrange.copy(),
                   "limited": mujoco.mjtLimited.mjLIMITED_TRUE}
@@ -231,6 +232,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
     if (count := len(list(spec.joints))) > MAX_JOINTS:
         raise HandError(f"{path} has {count} joints; expected at most {MAX_JOINTS}, fix those that are not the hand's")
     _hold_joints_without_range(spec, path, notes)
+    led = {equality.name1 for equality in spec.equalities if equality.active and equality.name2 and is_linear(equality)}
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             raise HandError(f"{path}: joint '{joint.name}' is a free joint; expected hinges, slides and balls")
@@ -238,11 +240,13 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
             joint.limited == mujoco.mjtLimited.mjLIMITED_AUTO and joint.range[0] < joint.range[1])
         if not limited:
             slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+            if joint.name in led:  # its leader limits it
+                _limit(spec, joint.name, *((-MAX_LENGTH, MAX_LENGTH) if slides else (-MAX_TURN, MAX_TURN)))
+                joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+                continue
             limit = SLIDE_LIMIT if slides else CONTINUOUS_LIMIT
             vain = f" that count ({told})" if (told := _told_range(joint.range)) else ""
-            # Angles are in the unit of the file, and compiled from there.
-            stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
-            joint.range = [-stated, stated]
+            _limit(spec, joint.name, -limit, limit)
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             notes.append(Note("warning", joint.name, f"{NO_LIMITS}{vain}; taken as +-{limit:.2f}"))
 
@@ -262,7 +266,7 @@ def _hold_joints_without_range(spec: mujoco.MjSpec, path: Path, notes: list[Note
                         "state their limits")
     led = {equality.name1 for equality in spec.equalities if is_linear(equality)}
     for joint in still:
-        unit = math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        unit = math.degrees(1) if joint.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
         value = float(joint.range[0])
         joint.range = [value - STILL * unit, value + STILL * unit]
         notes.append(Note("warning", joint.name, f"has both limits at {value:g} and is held there"))
@@ -579,7 +583,7 @@ def _state(
 
 
 def _limit(spec: mujoco.MjSpec, name: str, lower: float, upper: float) -> None:
-    """Limit a joint [rad or m], in the unit of the file."""
+    """Limit a joint [rad or m], in the unit of its own file, of which it is compiled."""
     joint = spec.joint(name)
-    turns = joint.type == mujoco.mjtJoint.mjJNT_HINGE and spec.compiler.degree
+    turns = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
     joint.range = [math.degrees(lower), math.degrees(upper)] if turns else [lower, upper]

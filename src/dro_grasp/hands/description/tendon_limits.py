@@ -44,8 +44,7 @@ def _tied(tendon: mujoco.MjsTendon) -> tuple[mujoco.MjsTendon, str, str] | None:
 def _tie(spec: mujoco.MjSpec, tendon: mujoco.MjsTendon, follower: str, leader: str) -> None:
     """The equality by which one joint follows another so that the tendon keeps the middle of its lengths."""
     share = {wrap.target.name: wrap.coef for wrap in tendon.path}
-    unit = math.radians(1) if spec.compiler.degree else 1.0
-    rest = {j.name: j.ref * (unit if j.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0)
+    rest = {j.name: j.ref * (math.radians(1) if j.compiler.degree and j.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0)
             for j in spec.joints if j.name in share}
     length = float(np.mean(tendon.range)) - sum(share[name] * rest[name] for name in share)
     equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=follower, name2=leader, objtype=mujoco.mjtObj.mjOBJ_JOINT)

@@ -253,11 +253,22 @@ def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes
     if not any(os.path.isfile(candidate) for candidate in _candidates(name, path.parent)):
         told = Note("warning", name, f"was not found, and {file} is taken for it")
         notes.extend([] if told in notes else [told])
-    readable = file.suffix.lower() in {".stl", ".obj", ".msh"}  # by MuJoCo; trimesh converts the others
+    # By MuJoCo; trimesh converts the others.
+    readable = file.suffix.lower() in {".stl", ".obj", ".msh"} and not _is_unusual_stl(file)
     stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
     mesh.set("filename", stand_in)
     files[stand_in] = file
     return ""
+
+
+def _is_unusual_stl(file: Path) -> bool:
+    """Whether a file is an STL that MuJoCo refuses and others read: text, or more than 200,000 faces."""
+    if file.suffix.lower() != ".stl":
+        return False
+    with file.open("rb") as opened:
+        head = opened.read(1000)
+    whole = file.stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little")
+    return int.from_bytes(head[80:84], "little") > 200_000 if whole else head.lstrip().startswith(b"solid") and b"facet" in head
 
 
 def as_obj(file: Path, notes: list[Note]) -> bytes:

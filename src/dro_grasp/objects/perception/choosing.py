@@ -247,7 +247,8 @@ def within(name: str, sight: Sight, mask: Any) -> Bool[np.ndarray, " n"]:
     if sight.shape is None:
         raise OptionError(f"a mask is given, and '{name}' is a cloud without an image; give the depth image, an organised "
                           "cloud (h, w, 3), or a place (at=(X, Y, Z))")
-    wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else numbers(mask, "the mask", "biuf") != 0
+    wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else (
+        np.nan_to_num(numbers(mask, "the mask", "biuf")) != 0)
     if wanted.shape != sight.shape:
         which = f"the mask {mask}" if isinstance(mask, str | Path) else "the mask"
         raise ObjectError(f"{which} has shape {wanted.shape}, and what the camera saw, '{name}', has {sight.shape}: rows and "

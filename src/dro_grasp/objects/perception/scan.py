@@ -66,7 +66,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
-        wanted = numbers(mask, "the mask", "biuf") != 0
+        wanted = np.nan_to_num(numbers(mask, "the mask", "biuf")) != 0
         if wanted.shape != image.shape:
             raise ObjectError(f"the mask has shape {wanted.shape}, the depth image {image.shape}; give one of the same size")
         valid = valid & wanted

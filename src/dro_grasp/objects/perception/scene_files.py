@@ -41,6 +41,12 @@ class SceneCamera:
             raise OptionError(f"T_frame_camera is not the camera's pose in the frame '{self.frame}', in metres: {fault}")
         if not is_name(self.frame):
             raise OptionError(f"frame is {self.frame!r}; expected a name on one line")
+        object.__setattr__(self, "T_frame_camera", np.array(self.T_frame_camera, np.float64))
+        if self.intrinsics is not None:
+            K = numbers(self.intrinsics, "the matrix of intrinsics").astype(np.float64)
+            if K.shape != (3, 3) or not np.isfinite(K).all():
+                raise OptionError(f"intrinsics have shape {K.shape}; give 3 rows of 3 finite numbers, in pixels")
+            object.__setattr__(self, "intrinsics", K)
         if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
             raise OptionError(f"depth_unit is {self.depth_unit}; give the metres of one count, such as 0.001")
 
@@ -102,7 +108,10 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     with reading(path, ObjectError, "a PNG that is not black on the object alone", Exception):
         check_bytes(path)
         with Image.open(path) as image:
-            return np.array(image.convert("L") if image.mode not in ("1", "I", "I;16") else image) != 0
+            if image.mode in ("1", "L", "I", "I;16", "F"):
+                return np.array(image) != 0
+            pixels = np.array(image.convert("RGBA"))
+            return pixels[..., :3].any(-1) & (pixels[..., 3] > 0)
 
 
 def sight_of_depth(depth: Num[np.ndarray, "..."], camera: SceneCamera | None, scale: float, origin: str) -> Sight:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from dro_grasp._version import __version__
+from dro_grasp.devices import on_accelerator
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.contacts import ContactConfig
@@ -87,6 +88,8 @@ class OptimiserSource(Source):
 
 def pinch(problem: GraspProblem, num: int, seed: int, config: OptimiserConfig) -> GraspBatch:
     """The best of several pinches for each that is wanted; none where no two sides of the object are opposed."""
+    if on_accelerator(problem.device):  # a search at random, with generators of the processor
+        problem = GraspProblem(problem.hand, problem.obj, "cpu", problem.constraints)
     generator, wanted, table = torch.Generator().manual_seed(seed), problem.constraints, problem.table
     assert table is not None
     assert config.pinch is not None

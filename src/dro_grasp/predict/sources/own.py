@@ -99,6 +99,8 @@ class FileSource(Source):
     def _stored(self, obj: ObjectModel) -> GraspBatch:
         """The stored grasps of an object."""
         parts = [part for _, part in self.grasps.by_object() if part.object[0] == obj.name]
+        if not parts and (asked := {key: n for key, n in self.grasps.asked_of.items() if key[0] == obj.name}):
+            return self.grasps[:0].replace(asked_of=asked)  # an answer of nothing
         if not parts:
             held = ", ".join(sorted(set(self.grasps.object))[:5])
             raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with "
