@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dro_grasp.compare.methods import Method
-from dro_grasp.compare.stages import Returned, equal_time, finished_maker
+from dro_grasp.compare.stages import Returned, best_within, equal_time, finished_maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import PredictorConfig
@@ -132,3 +132,14 @@ def test_every_methods_candidates_are_finished_as_its_predictor_is_told(tmp_path
         assert len(made) == (3 if config.settle is not None else 5)
         assert torch.equal(made.score, expected.pool.score)
         assert torch.equal(made.joints, expected.pool.joints)
+
+
+def test_a_grasp_that_comes_again_counts_once() -> None:
+    clock, stored = Clock(), made_up_grasps(HAND, "sphere", 3, score=torch.arange(3.0))
+
+    def make(num: int, seed: int) -> GraspBatch:
+        clock.now += COST * num
+        return stored[torch.arange(num) % 3]
+
+    found = best_within(8.0, make, KEEP, 0, clock)
+    assert sorted(found.grasps.score.tolist()) == [0.0, 1.0, 2.0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,6 +15,8 @@ from dro_grasp.files import check_output
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import UNKNOWN_PROTOCOL
+from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation
+from dro_grasp.grasps.sources import object_source
 from dro_grasp.simulation.protocols import PROTOCOLS, Perturbations, Protocol, changed
 from tests.helpers.toy_batches import BALL, CUBE, HAND, evaluated, make
 
@@ -201,3 +204,15 @@ def test_protocols_as_trials_state_them_are_read(tmp_path):
     labels = [own.label, robust.label, light.label, f"{light.label}, {robust.label}", UNKNOWN_PROTOCOL, "strict"]
     evaluated(len(labels)).replace(protocol=tuple(labels)).save(tmp_path / "g.parquet")
     assert list(GraspBatch.load(tmp_path / "g.parquet").protocol) == labels
+
+
+def test_the_scale_is_that_of_the_file_that_is_recorded() -> None:
+    plain = make(1)
+    own = plain.replace(extra={"object_file": ["/ball.stl"], "object_scale": torch.tensor([0.001])})
+    assert object_source(GraspBatch.concatenate([plain, own])) == ("/ball.stl", pytest.approx(0.001))
+
+
+def test_a_hold_that_nobody_knows_is_none_in_a_file_too(tmp_path: Path) -> None:
+    known = make(2).replace(extra={name: torch.ones(2, 3) for name in HOLD_COLUMNS})
+    GraspBatch.concatenate([known, make(2)])[[2, 3]].save(tmp_path / "none.parquet")
+    assert HoldExpectation.of(GraspBatch.load(tmp_path / "none.parquet"), 0) is None

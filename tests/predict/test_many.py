@@ -81,6 +81,7 @@ def test_an_object_without_grasps_has_an_empty_batch(weights: str) -> None:
     with pytest.warns(UserWarning, match="meet what was asked of them"):
         found = doubtful.predict_many(HAND, OBJECTS[:2], 2, source="network", least_confidence=0.999999)
     assert [len(grasps) for grasps in found] == [0, 0]
+    assert GraspBatch.concatenate(found).asked == 4, "what is not returned has failed"
     made = doubtful.run_many(
         problems_of(HAND, OBJECTS[:1], "cpu", Constraints()), GraspRequest(2, source="network", least_confidence=0.999999))
     assert isinstance(made[0], NoGraspError)

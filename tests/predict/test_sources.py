@@ -230,6 +230,17 @@ def test_stored_grasps_are_a_source_of_their_hand_and_objects(tmp_path: Path) ->
         source.propose(GraspProblem(hand, load_object("can")), 1, 0)
 
 
+def test_a_stored_answer_of_nothing_is_an_answer(tmp_path: Path) -> None:
+    hand, obj = toy_hand(), load_object("sphere")
+    stored = make_source("start").propose(GraspProblem(hand, obj), 5, 0)
+    assert isinstance(stored, GraspBatch)
+    can = load_object("can")
+    stored.replace(asked_of={("sphere", obj.sha256): 5, ("can", can.sha256): 3}).save(tmp_path / "theirs.parquet")
+    source = make_source(str(tmp_path / "theirs.parquet"))
+    assert len(source.propose(GraspProblem(hand, can), 3, 0)) == 0
+    assert source.asked(can, 8) == 3
+
+
 @pytest.mark.parametrize("name", [
     "start", "auto", "network", "optimise", "mean-grasp", "", "my:source", "a@b", "a.parquet", "a/b"])
 def test_a_name_that_is_taken_or_means_something_else_is_refused(registering: Callable[..., None], name: str) -> None:
