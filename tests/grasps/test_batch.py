@@ -309,6 +309,7 @@ def test_a_further_column_of_three_axes_is_refused() -> None:
         make(2).replace(extra={"mine": torch.zeros(2, 2, 3)})
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("kind", [np.uint8, np.int8, np.int16])
 def test_indices_of_any_size_choose(kind: type) -> None:
     batch = make(2)

@@ -386,6 +386,7 @@ def test_masks_are_what_is_seen_of_them(tmp_path: Path) -> None:
     assert len(points) == on.sum()
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_a_camera_of_lists_is_one_of_arrays() -> None:
     made = make_scene("table", 1, 0, width=160)
     K = np.asarray(made.camera.intrinsics)
