@@ -191,3 +191,30 @@ def test_another_robot_of_the_same_name_is_refused(robot: dro.Robot, plan: dro.M
     replace(plan, notes=replace(plan.notes, T_world_wrist=T.tolist())).save(tmp_path / "other.npz")
     with pytest.raises(OptionError, match=r"is not the one of the plan in .*other.npz: its wrist is elsewhere"):
         lift_page(tmp_path / "other.npz", port=free_port())
+
+
+def test_the_attempt_that_is_named_is_the_one_that_is_shown(robot: dro.Robot, tmp_path: Path) -> None:
+    label, played = TabletopConfig().label(), list[int]()
+    stored = [Attempt(robot.name, "can", i, 0, label, True, "done", robot_file="xarm7_leaphand") for i in range(3)]
+
+    def made(used: dro.Robot, obj: object, number: int, seed: int, predictor: object, _: object, recorder: Recorder) -> Attempt:
+        if played and number == 2:
+            raise OptionError("it cannot be repeated")
+        played.append(number)
+        recorder.frames.append((used.home, used.open_hand, np.zeros((0, 4, 4))))
+        return stored[number]
+
+    write_attempts(stored, tmp_path / "results.parquet")
+    page = lift_page(tmp_path / "results.parquet", 1, port=free_port(), make=made)
+    try:
+        assert page.picked.value.startswith("1: ")
+        page.picked.value = page.labels[0]
+        page._pick()
+        assert (played, page.picked.value) == ([1, 0], page.labels[0])
+        film, page.picked.value = page.film, page.labels[2]
+        page._pick()
+        assert "it cannot be repeated" in page.text.content
+        assert page.film is film
+        assert page.picked.value == page.labels[0]
+    finally:
+        page.stop()

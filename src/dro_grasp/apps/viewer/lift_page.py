@@ -19,7 +19,7 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.animation import VIEW, Recorder, colour_of
 from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour
 from dro_grasp.network.checkpoints import describe_weights
 from dro_grasp.objects.catalogue import load_object
@@ -72,6 +72,7 @@ class LiftPage(ServedPage, Page):
         gui = self.server.gui
         self.name = gui.add_markdown("")
         if self.attempts:
+            self.shown = 0
             self.labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
             self.picked = gui.add_dropdown("Attempt", self.labels, initial_value=self.labels[0])
             self.picked.on_update(lambda event: None if event.client is None else self._pick())
@@ -85,9 +86,17 @@ class LiftPage(ServedPage, Page):
             choice.on_update(lambda _: self._show_layers())
 
     def _pick(self) -> None:
-        """Repeat the attempt that was picked, once what plays has stopped."""
-        self.film = None
-        self._guarded(lambda: self.repeat(self.labels.index(self.picked.value)), PATIENCE)
+        """Repeat the attempt that was picked, once what plays has stopped; the one before stays where that fails."""
+        before, self.film = self.film, None
+
+        def work() -> None:
+            try:
+                self.repeat(self.labels.index(self.picked.value))
+            except DroGraspError:
+                self.film, self.picked.value = before, self.labels[self.shown]
+                raise
+
+        self._guarded(work, PATIENCE)
 
     def repeat(self, index: int) -> None:
         """Run a stored attempt once more with its own robot and weights, and show it, and what of these has changed since.
@@ -98,7 +107,7 @@ class LiftPage(ServedPage, Page):
         """
         if not 0 <= index < len(self.attempts):
             raise OptionError(f"attempt is {index}; give one of 0 to {len(self.attempts) - 1}")
-        stored, recorder, self.picked.value = self.attempts[index], Recorder(RATE), self.labels[index]
+        stored, recorder = self.attempts[index], Recorder(RATE)
         config = TabletopConfig.from_label(stored.settings)
         self.text.content = f"Running attempt {index} once more: seeing, planning, lifting ..."
         same = stored.robot_sha256 == self.robot.sha256
@@ -114,6 +123,7 @@ class LiftPage(ServedPage, Page):
             ("robot", stored.robot_sha256, robot.sha256), ("object", *of_object),
             ("weights", stored.weights_sha256, describe_weights(weights)["sha256"])) if then not in {"", now}]
         changed = f"**Not as stored**: with other content than then: {', '.join(others)}. " if others else ""
+        self.shown, self.picked.value = index, self.labels[index]
         self.show(film, changed + ("held" if made.success else f"**{escaped(made.stage)}**: {escaped(made.reason)}"))
 
     def show(self, film: Film, outcome: str = "") -> None:
