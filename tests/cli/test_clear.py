@@ -90,3 +90,17 @@ def test_a_file_that_is_no_file_of_tables_stays(
     assert clear("--output", path) == 2
     assert "a file of cleared tables" in capsys.readouterr().err
     assert path.read_text() == '{"a": 1}\n'
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31])
+def test_a_seed_out_of_range_is_refused(seed: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert clear("--seed", seed) == 2
+    assert f"seed is {seed}; give an integer from 0" in capsys.readouterr().err
+
+
+def test_a_table_on_which_nothing_moved_keeps_the_others(played: list[Any], tmp_path: Path, capsys) -> None:
+    assert clear("--tables", 2, "--things", 2, "--record", tmp_path / "r.npz") == 2
+    said = capsys.readouterr()
+    assert [number for number, *_ in played] == [0, 1]
+    assert "2 of 4 things removed" in said.out
+    assert "nothing has moved" in said.err

@@ -272,6 +272,8 @@ def written(made: MadeScene, folder: Path) -> tuple[Path, Path]:
     (("--robot", "xarm7_leaphand", "--hand", "allegro", "--scene", "depth.png"), "the robot has a hand"),
     (("--camera", "robot", "--scene", "depth.png"), "name the robot, too"),
     (("--scene", "depth.png"), "is a depth image; give its camera"),
+    (("--robot", "xarm7_leaphand"), "--robot is for motions of an arm, or for --scene; leave it out"),
+    (("--attempt", "3"), "--attempt is for motions of an arm"),
 ])
 def test_options_that_contradict_one_another_are_refused(
     made: MadeScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],

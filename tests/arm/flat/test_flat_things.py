@@ -278,6 +278,10 @@ def test_a_push_as_a_plan(narrow: Robot, pushed: tuple[dro.ObjectModel, MotionPl
     assert "pushes object 'board'" in dro.trajectory_yaml(again)
     assert [stage["name"] for stage in dro.task_stages(again, narrow)][-3:] == ["retreat", "open again", "look again"]
     assert "then look again, and plan again" in made.lines()[0]
+    T, turned = np.array(made.notes.slide), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    middle = made.scene.points.mean(0)
+    T[:3, :3], T[:3, 3] = turned, middle + np.array([0.2, 0, 0]) - turned @ middle
+    assert "pushed by 20 cm" in replace(made, notes=replace(made.notes, slide=T.tolist())).lines()[0], "however it turns"
     film = Film.of_plan(narrow, again)
     assert np.array_equal(film.poses[0, 0], np.eye(4))
     assert np.allclose(film.poses[-1, 0], np.array(made.notes.slide))
