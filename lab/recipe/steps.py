@@ -103,14 +103,14 @@ def data(size: Size, folder: str) -> list[Step]:
     steps = [
         Step("made hands", f"dro-grasp hand make --seed {FIRST_MADE} --num {size.made} --output {made} --overwrite",
              f"{made}/hands.csv"),
-        grasps("known", hands, f"{known} {validate}".strip(), usual, 0.35),
+        grasps("known", hands, f"{known} {validate}".strip(), usual, 0.2),
         grasps("fuller", hands, known, max(1, usual // 3), 0.1, "--idle 0.2 --seed 7"),
-        grasps("procedural", hands, size.procedural, drawn, 0.2),
-        grasps("made", " ".join(made_hands(size, folder)), f"{known} {size.procedural}", by_made, 0.25,
+        grasps("procedural", hands, size.procedural, drawn, 0.25),
+        grasps("made", " ".join(made_hands(size, folder)), f"{known} {size.procedural}", by_made, 0.4,
                f"--seed 0 --shard {size.part}"),
     ]
     if size.held_out:
-        steps.append(grasps("held_out", " ".join(size.held_out), f"assets:train {validate}", few, 0.1))
+        steps.append(grasps("held_out", " ".join(size.held_out), f"assets:train {validate}", few, 0.05))
     return steps
 
 
