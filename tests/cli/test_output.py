@@ -28,6 +28,14 @@ def test_columns_that_say_nothing_are_left_out(capsys: pytest.CaptureFixture[str
     assert "size" in capsys.readouterr().out, "an empty table keeps its head"
 
 
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal of 60 columns."""
+    monkeypatch.setattr("dro_grasp.cli.output.stdout.width", 60)
+    monkeypatch.setattr("dro_grasp.cli.output.stdout._force_terminal", True)
+
+
+@pytest.mark.usefixtures("narrow")
 def test_long_names_are_folded_and_never_cut(capsys: pytest.CaptureFixture[str]) -> None:
     names = [f"{letter}_hand_{'x' * 60}_left" for letter in "ab"]
     print_table("t", ["hand", "object", "rate"], [[*names, 0.5]])
@@ -36,8 +44,15 @@ def test_long_names_are_folded_and_never_cut(capsys: pytest.CaptureFixture[str])
     assert said.count("x") == 120
 
 
-def test_the_names_of_usual_sources_are_not_broken(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.cli.output.stdout.width", 60)
+def test_tables_in_files_are_as_wide_as_they_need_to_be(capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"{letter}_hand_{'x' * 60}_left" for letter in "ab"]
+    print_table("t", ["hand", "object", "rate"], [[*names, 0.5]])
+    lines = capsys.readouterr().out.splitlines()
+    assert any(all(name in line for name in (*names, "0.5")) for line in lines)
+
+
+@pytest.mark.usefixtures("narrow")
+def test_the_names_of_usual_sources_are_not_broken(capsys: pytest.CaptureFixture[str]) -> None:
     head = ["grasp", "origin", "confidence", "carries [kg]", "squeeze [N]", "success", "contacts", "penetration [mm]"]
     for name, whole in (("optimiser", True), ("my_module_of_grasps:MySource", False)):
         print_table("t", head, [[0, name, "99 %", 1.2, 14, True, 6, 1.2]])

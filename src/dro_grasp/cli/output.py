@@ -17,10 +17,11 @@ from dro_grasp.cli.switches import in_switches
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
+endless = Console(highlight=False, markup=False, width=10_000)  # for tables in files and pipes, whose lines have no end
 
 
 NOTHING = ("", "-")  # Cells without a value
-SHORT = 12  # Letters of the name of a source up to which it is not broken
+SHORT = 12  # Letters of names and sources up to which they are not broken
 
 
 def say(text: str) -> None:
@@ -88,11 +89,11 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     table = Table(title=title, title_justify="left")
     for i, column in compress(enumerate(columns), told):
         words = column in {"name", "hand", "object", "reason", "from"}
-        short = column == "origin" and all(len(row[i]) <= SHORT for row in cells)
+        short = column in {"name", "hand", "origin"} and all(len(row[i]) <= SHORT for row in cells)
         table.add_column(column, overflow="fold", justify="left" if words else "right", no_wrap=short)
     for row in cells:
         table.add_row(*compress(row, told))
-    stdout.print(table)
+    (stdout if stdout.is_terminal else endless).print(table)
 
 
 def _cell(value: Any) -> str:
