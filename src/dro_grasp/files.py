@@ -9,9 +9,9 @@ import secrets
 import shlex
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from pickle import UnpicklingError
 from tokenize import TokenError
@@ -110,6 +110,12 @@ def is_unread(error: BaseException | None) -> bool:
     # Arrow raises an OSError without a number over damaged content, PyTorch a RuntimeError where memory ends.
     return (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)
             or (isinstance(error, RuntimeError) and "allocate memory" in str(error)))
+
+
+def free_name(stem: str, taken: Container[str], ending: str = "", numbered: str = "-{}") -> str:
+    """The name of a stem and an ending, or where it is taken the first one with a number, from 2 on, that is not."""
+    names = chain([stem + ending], (stem + numbered.format(number) + ending for number in count(2)))
+    return next(name for name in names if name not in taken)
 
 
 def set_aside(path: Path, *beside: Path) -> Path:

@@ -14,8 +14,8 @@ from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.files import check_output
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import UNKNOWN_PROTOCOL
-from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation
+from dro_grasp.grasps.columns import HOLD_COLUMNS, UNKNOWN_PROTOCOL
+from dro_grasp.grasps.hold import HoldExpectation
 from dro_grasp.grasps.sources import object_source
 from dro_grasp.simulation.protocols import PROTOCOLS, Perturbations, Protocol, changed
 from tests.helpers.toy_batches import BALL, CUBE, HAND, evaluated, make

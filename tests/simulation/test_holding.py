@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
+from dro_grasp.grasps.columns import HOLD_COLUMNS
 from dro_grasp.grasps.controller import complete
-from dro_grasp.grasps.hold import HOLD_COLUMNS, HoldExpectation, check_hold
+from dro_grasp.grasps.hold import HoldExpectation, check_hold
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.conditions import draw

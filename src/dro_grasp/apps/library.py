@@ -8,14 +8,14 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Hashable
 from functools import cached_property
-from itertools import chain, count
+from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from cachetools import LRUCache
 
 from dro_grasp.errors import OptionError
-from dro_grasp.files import reading
+from dro_grasp.files import free_name, reading
 from dro_grasp.hands.description.urdf import find_mesh
 from dro_grasp.hands.description.xml_files import parse_xml
 from dro_grasp.hands.hand import Hand
@@ -66,8 +66,7 @@ class Library:
         folder.mkdir()
         path = store_upload(name, content, folder)
         taken = {name for other, own in self.own.items() if other != kind for name in own}
-        numbered = (f"{path.stem} ({number}){path.suffix}" for number in count(2))
-        label = next(name for name in chain([path.name], numbered) if name not in taken)
+        label = free_name(path.stem, taken, path.suffix, " ({})")
         self.add(kind, label, path)
         return label
 

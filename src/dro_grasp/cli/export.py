@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +11,7 @@ import tyro
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say
 from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.files import check_folder, check_output, make_folder, replacing
+from dro_grasp.files import check_folder, check_output, free_name, make_folder, replacing
 from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
@@ -59,8 +58,7 @@ class Export:
             make_folder(target)
         written, labels = list[Path](), set[str]()
         for name, job in jobs.items():
-            plain = name.replace("/", "-")
-            label = next(each for each in chain([plain], (f"{plain}-{k}" for k in count(2))) if each not in labels)
+            label = free_name(name.replace("/", "-"), labels)
             labels.add(label)
             place = target / (label if form.file_per_grasp else f"{label}{form.suffix}")
             written += write(form.content(job), place if len(jobs) > 1 else target, form.suffix)

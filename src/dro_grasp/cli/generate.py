@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -16,7 +15,7 @@ from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
 from dro_grasp.extras import require_extra
-from dro_grasp.files import check_folder, check_output, given_path, make_folder
+from dro_grasp.files import check_folder, check_output, free_name, given_path, make_folder
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -395,6 +394,6 @@ def paths_per_object(path: Path | None, names: list[str], several: bool, suffix:
     labels = list[str]()
     for name, stem in zip(names, stems, strict=True):
         own = Path(name).name.replace(".", "_") if stems.count(stem) > 1 else stem
-        labels.append(next(each for each in chain([own], (f"{own}-{k}" for k in count(2))) if each not in labels))
+        labels.append(free_name(own, labels))
     files = (path / f"{label}{suffix}" for label in labels)
     return [check_output(file) if path.is_dir() else file for file in files]

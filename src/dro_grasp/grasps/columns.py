@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.files import MAX_QUOTED_CHARS
+from dro_grasp.files import MAX_QUOTED_CHARS, free_name
 from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
@@ -53,10 +52,14 @@ for none."""
 ENERGY_TERM = "energy_"  # How the names of further columns with the terms of the grasp energy begin
 Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the name and hash of their object
 
-
+HOLD_COLUMNS = ("held_joints", "held_torque", "empty_joints", "empty_torque", "hold_unit")
+"""Further columns of a batch: joints [rad or m] and efforts [Nm or N] with the object in the hand and without, and what counts
+as a radian to each joint: 1, or a length where it slides [m]."""
+WEIGHT_COLUMN = "held_weight"
+"""Further column: the object's weight [N]."""
 OF_POSES = frozenset({
-    DEPTH, "held_joints", "held_torque", "empty_joints", "empty_torque", "hold_unit", "held_weight", "object_penetration",
-    "deepest_self_penetration", "touching_links", "contact_distance", "contact_spread", "q1", "wrench_error"})
+    DEPTH, *HOLD_COLUMNS, WEIGHT_COLUMN, "object_penetration", "deepest_self_penetration", "touching_links",
+    "contact_distance", "contact_spread", "q1", "wrench_error"})
 """Further columns that belong to a pose and joints: depth, what to expect of a hold, and measures of contact."""
 
 
@@ -137,14 +140,12 @@ def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]
     hash is unknown, the object is the first of its name.
     """
     first = {name: sha256 for name, sha256 in zip(reversed(objects), reversed(hashes), strict=True) if sha256}
-    taken_names, labels = set(objects), dict[tuple[str, str], str]()
+    others, labels = set(objects), dict[tuple[str, str], str]()
     rows: dict[str, list[int]] = {}
     for i, (name, sha256) in enumerate(zip(objects, hashes, strict=True)):
         key = name, sha256 or first.get(name, "")
         if key not in labels:
-            numbered = (f"{name} ({number})" for number in count(2))
-            labels[key] = name if name not in rows else next(label for label in numbered if label not in taken_names)
-            taken_names.add(labels[key])
+            labels[key] = name if name not in rows else free_name(name, others | set(rows), numbered=" ({})")
         rows.setdefault(labels[key], []).append(i)
     return rows
 

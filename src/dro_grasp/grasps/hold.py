@@ -19,13 +19,9 @@ from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.kinds import Checked
 
-HOLD_COLUMNS = ("held_joints", "held_torque", "empty_joints", "empty_torque", "hold_unit")
-"""Further columns of a batch: joints [rad or m] and efforts [Nm or N] with the object in the hand and without, and what counts
-as a radian to each joint: 1, or a length where it slides [m]."""
-WEIGHT_COLUMN = "held_weight"
-"""Further column: the object's weight [N]."""
 HoldState = Literal["held", "empty", "slipping", "unexpected"]
 STATES: tuple[HoldState, ...] = ("held", "empty", "slipping", "unexpected")
 """In the order of HoldConfig.priors; the last has the probability of its doubt."""

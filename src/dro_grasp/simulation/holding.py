@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.controller import complete
-from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.simulation.payload import GRAVITY, servo_torques

@@ -11,8 +11,8 @@ import torch
 import yaml
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.export.writers import Frame, csv_table, dexgraspbench, isaac_grasp, moveit_grasps
-from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.hands.hand import Hand
 from tests.grasps.export.test_forces import posed
 from tests.helpers.loaded_hands import loaded_hand

@@ -15,11 +15,11 @@ from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS
 from dro_grasp.grasps.controller import complete
 from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.export.usd import usd_file
 from dro_grasp.grasps.export.writers import Frame
-from dro_grasp.grasps.hold import HOLD_COLUMNS
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel

@@ -20,9 +20,10 @@ from dro_grasp.arm.robots.drivers import Drivers
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.errors import PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.export.writers import yaml_text
 from dro_grasp.grasps.forces import forces_in_words
-from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN, HoldCheck, HoldExpectation, check_hold
+from dro_grasp.grasps.hold import HoldCheck, HoldExpectation, check_hold
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""

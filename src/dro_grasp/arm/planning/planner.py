@@ -27,8 +27,8 @@ from dro_grasp.errors import NoGraspError, OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
-from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.admission import violations

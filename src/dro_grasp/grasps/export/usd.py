@@ -7,7 +7,6 @@ documentation of UsdGeom and of variant sets; names that begin with `dro_grasp:`
 from __future__ import annotations
 
 from importlib import import_module
-from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
+from dro_grasp.files import free_name
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Colour
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.export.formats import ExportJob
@@ -105,8 +105,7 @@ def _add_links(stage: Any, hand: Hand) -> list[str]:
     UsdGeom.Xform.Define(stage, "/World/hand")
     taken = dict[str, str]()
     for name in hand.tree.link_names:
-        valid = Tf.MakeValidIdentifier(name)
-        taken[next(each for each in chain([valid], (f"{valid}_{k}" for k in count(1))) if each not in taken)] = name
+        taken[free_name(Tf.MakeValidIdentifier(name), taken, numbered="_{}")] = name
     paths = [f"/World/hand/{valid}" for valid in taken]
     for path, name in zip(paths, taken.values(), strict=True):
         link = UsdGeom.Xform.Define(stage, path)

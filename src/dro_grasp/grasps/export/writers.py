@@ -20,9 +20,10 @@ from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps import columns
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
-from dro_grasp.grasps.hold import HOLD_COLUMNS, WEIGHT_COLUMN, HoldExpectation
+from dro_grasp.grasps.hold import HoldExpectation
 from dro_grasp.grasps.sources import camera_pose, frame_of
 from dro_grasp.hands.hand import Hand
 
