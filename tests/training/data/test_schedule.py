@@ -65,6 +65,7 @@ def test_later_shards_know_the_earlier_ones_and_are_as_large_as_the_yield_asks(t
     assert GraspBatch.load(Shard("a", "x", 0).path(tmp_path)).object == ("x",) * GRASPS
     # 5 of 64, so 95 more would take 1216: the largest shard there is.
     assert [t.candidates for t in tasks[:2]] == [64, 512]
+    assert [PairState().next_candidates(goal, EngineConfig()) for goal in (1, 12, 1000)] == [64, 128, 256]
     state = PairState(total=Yield(candidates=256, valid=100))
     assert state.next_candidates(150, EngineConfig()) == 128
     assert state.next_candidates(180, EngineConfig()) == 256  # 205 in steps of 64

@@ -33,6 +33,7 @@ from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, J
 
 REPORT_EVERY = 10.0  # Time between lines of progress [s]. Ours
 CANDIDATE_STEP = 64  # Shards have a multiple of this many candidates. Ours
+CANDIDATES_PER_GRASP = 8  # Candidates of a first shard for each grasp that is asked for, before a yield is known. Ours
 Pair = tuple[str, str]
 Content = TypeVar("Content")
 
@@ -60,11 +61,13 @@ class PairState:
 
     def next_candidates(self, goal: int, config: EngineConfig) -> int:
         """Size of the next shard: the missing grasps at the pair's yield so far, within the config's bounds."""
-        if not self.total.candidates or not self.grasps:
+        if self.total.candidates and not self.grasps:
             return config.candidates
-        wanted = (goal - self.grasps) * self.total.candidates / self.grasps
-        steps = math.ceil(wanted / CANDIDATE_STEP) * CANDIDATE_STEP
-        return min(max(steps, config.min_candidates), config.max_candidates)
+        each, most = CANDIDATES_PER_GRASP, config.candidates
+        if self.grasps:
+            each, most = self.total.candidates / self.grasps, config.max_candidates
+        steps = math.ceil((goal - self.grasps) * each / CANDIDATE_STEP) * CANDIDATE_STEP
+        return min(max(steps, config.min_candidates), most)
 
     def why_given_up(self, goal: int, config: EngineConfig) -> str:
         """Why the pair gets no more shards although it has too few grasps; empty if it is full or goes on."""

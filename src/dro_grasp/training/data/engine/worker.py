@@ -60,9 +60,9 @@ class EngineConfig(Checked):
     seconds: float | None = None
     """No new shard starts after this time [s]; those in flight are finished. None for no limit."""
     candidates: int = 256
-    """Candidates of a pair's first shard; the size of later shards follows the pair's yield."""
-    min_candidates: int = 128
-    """Smallest later shard."""
+    """Most candidates of a pair's first shard; the size of later shards follows the pair's yield."""
+    min_candidates: int = 64
+    """Smallest shard."""
     max_candidates: int = 768
     """Largest later shard."""
     trial_share: float = 0.7
