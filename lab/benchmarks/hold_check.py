@@ -114,7 +114,7 @@ def situations(hand: Hand, name: str, obj: ObjectModel, grasps: GraspBatch, rng:
     def measured(kind: str, i: int, rows: Float[np.ndarray, "k n_dof"], load: float) -> Measured:
         expected = HoldExpectation.of(twice, i)
         assert expected is not None
-        exerted = servo_torques(hand, torch.from_numpy(rows[-1]), twice.squeeze_joints[i].double(), scene.protocol.stiffness)
+        exerted = servo_torques(hand, torch.from_numpy(rows[-1]), twice.squeeze_joints[i].double(), scene.protocol)
         # An object that is missing from the beginning was missing before the lift, too.
         before = None if kind == "empty" else closed[i]
         return Measured(name, kind, expected, rows[-1], exerted.numpy() * conditions.gain[i], before, rows, load)

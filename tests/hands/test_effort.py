@@ -12,10 +12,11 @@ import torch
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.effort import TIP_FORCE, find_efforts, suited_efforts
 from dro_grasp.hands.library import load_hand
+from dro_grasp.simulation.payload import servo_torques
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import build_scene
 from tests.helpers.claw import ball, claw_xml
-from tests.helpers.claw_urdf import claw, joint, written
+from tests.helpers.claw_urdf import claw, joint, link, written
 
 
 def with_efforts(folder: Path, a: str, b: str) -> Path:
@@ -76,6 +77,42 @@ def test_actuators_of_an_mjcf_state_the_effort_of_their_joint(tmp_path: Path, ac
     told = dict(zip(hand.tree.joint_names, hand.description.efforts.tolist(), strict=True))
     assert told["base0"] == pytest.approx(expected)
     assert np.isnan(told["knuckle0"])
+
+
+@pytest.mark.parametrize("coefs", [(1.0, 1.0), (1.0, -2.0), (0.5, 2.0)])
+def test_the_leader_of_joints_on_a_tendon_does_the_work_of_all(tmp_path: Path, coefs: tuple[float, float]) -> None:
+    """Oracle: virtual work of MuJoCo's own forces at both joints, as one length of the tendon moves them."""
+    fixed = "".join(f"<joint joint='{name}' coef='{c}'/>" for name, c in zip(("base0", "knuckle0"), coefs, strict=True))
+    text = claw_xml().replace(' actuatorfrcrange="-0.001 0.001"', "").replace(
+        "</mujoco>", f"<tendon><fixed name='t'>{fixed}</fixed></tendon>"
+        "<actuator><general tendon='t' gear='2' forcerange='-0.3 0.3'/></actuator></mujoco>")
+    (tmp_path / "hand.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1e6
+    mujoco.mj_forward(model, data)
+    forces = [data.qfrc_actuator[model.joint(name).dofadr[0]] for name in ("base0", "knuckle0")]
+    work = forces[0] + forces[1] * coefs[0] / coefs[1]
+    hand = load_hand(tmp_path / "hand.xml")
+    assert "knuckle0" not in hand.tree.joint_names
+    assert hand.description.efforts[hand.tree.joint_names.index("base0")] == pytest.approx(abs(work))
+
+
+def test_a_slide_that_turns_fingers_by_rods_has_the_unit_of_its_servo(tmp_path: Path) -> None:
+    rod = ('<joint name="rod" type="prismatic"><parent link="palm"/><child link="rod"/><axis xyz="0 0 1"/>'
+           '<limit lower="0" upper="0.016" effort="60" velocity="1"/></joint>')
+    turns = ['<limit lower="0" upper="0.8" effort="1" velocity="1"/><mimic joint="rod" multiplier="50"/>'] * 2
+    path = written(tmp_path, claw(
+        links=link("left") + link("right") + link("rod", '<box size="0.01 0.01 0.01"/>'),
+        joints=rod + joint("a", "palm", "left", "-0.035 0 0.01", more=turns[0])
+        + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0", turns[1])))
+    hand, rules = load_hand(path), PROTOCOLS["carry"]
+    model = build_scene(hand, ball(), rules).model
+    assert hand.tree.joint_names == ("rod",)
+    stiffness = model.actuator_gainprm[0, 0]
+    assert rules.stiffness / float(hand.tree.joint_unit[0]) ** 2 == pytest.approx(stiffness)
+    assert float(servo_torques(hand, torch.tensor([0.001]), torch.tensor([0.002]), rules)) == pytest.approx(
+        0.001 * stiffness, rel=1e-4)
 
 
 def test_servos_of_carry_end_at_the_effort_and_those_of_strict_do_not(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def test_what_gives_way_is_what_cvxpy_says(hand: Hand) -> None:
     masses = torch.tensor([0.1, 0.7])
     moved, turned = given_way(chosen, masses, config)
     wrench, torque, _ = (x[0].double().numpy() for x in generators(chosen.contacts, config))
-    spring = servo_torques(hand, chosen.joints, chosen.base, 3.0)[0].double().numpy()
+    spring = servo_torques(hand, chosen.joints, chosen.base, PROTOCOLS["carry"])[0].double().numpy()
     for i, mass in enumerate(masses.tolist()):
         for k, axis in enumerate(AXES):
             amounts = cvxpy.Variable(wrench.shape[1], nonneg=True)
@@ -124,10 +124,10 @@ def light_grasp(hand: Hand, obj: ObjectModel) -> GraspBatch:
     return grasps.replace(squeeze_joints=grasps.joints + 0.3 * (grasps.squeeze_joints - grasps.joints))
 
 
-def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.ndarray]]:
+def closed_plainly(hand: Hand, obj: ObjectModel, protocol: str) -> Iterator[tuple[float, np.ndarray]]:
     """Sum of the normal forces on the object, and torques of the servos, after each half of the closing of one grasp."""
-    grasps = light_grasp(hand, obj)
-    scene = scene_of(hand, obj, grasps, "carry")
+    grasps, rules = light_grasp(hand, obj), PROTOCOLS[protocol]
+    scene = scene_of(hand, obj, grasps, protocol)
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = scene.qpos(grasps.T_object_wrist, grasps.pregrasp_joints)[0]
     postures = [q[0].numpy()[scene.actuated] for q in (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)]
@@ -135,7 +135,7 @@ def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.nda
     for begin, end in pairwise(postures):
         for i in range(RAMP):
             data.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
-            for _ in range(round(PROTOCOLS["carry"].closing_time / model.opt.timestep) // RAMP):
+            for _ in range(round(rules.closing_time / model.opt.timestep) // RAMP):
                 mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)
         total, force = 0.0, np.zeros(6)
@@ -146,12 +146,13 @@ def closed_plainly(hand: Hand, obj: ObjectModel) -> Iterator[tuple[float, np.nda
         torque = np.zeros(hand.tree.n_dof)
         torque[scene.actuated] = data.actuator_force
         speed = np.array([data.qvel[model.joint(f"hand/{n}").dofadr[0]] for n in hand.tree.joint_names])
-        yield total, torque + PROTOCOLS["carry"].damping * speed
+        yield total, torque + rules.damping * speed
 
 
-def test_forces_are_those_that_mujoco_states(hand: Hand, obj: ObjectModel) -> None:
-    found = find_forces(hand, obj, light_grasp(hand, obj))
-    halves = list(closed_plainly(hand, obj))
+@pytest.mark.parametrize("protocol", ["carry", "dexgraspbench"])  # whose servos are stiffer
+def test_forces_are_those_that_mujoco_states(hand: Hand, obj: ObjectModel, protocol: str) -> None:
+    found = find_forces(hand, obj, light_grasp(hand, obj), protocol)
+    halves = list(closed_plainly(hand, obj, protocol))
     for (total, torque), contacts, torques in zip(halves, (found.grasp_contacts, found.squeeze_contacts),
                                                   (found.grasp_torque, found.squeeze_torque), strict=True):
         assert float(contacts[0].pressure.sum()) == pytest.approx(total, rel=1e-3, abs=1e-3)

@@ -91,6 +91,21 @@ def test_the_table_bears_what_fingers_press_down(jaws: Hand, table: bool) -> Non
     assert (abs(fell) < 0.002) if table else (fell > 0.01)
 
 
+def test_the_table_is_there_in_both_halves_of_a_closing_that_is_looked_at_in_between(jaws: Hand) -> None:
+    obj = block((0.02, 0.05, 0.02))
+    grasp = pinch(jaws, obj, 0.001, 0.02, np.eye(4))
+    ends = []
+    for halves in ([(0, 1), (1, None)], [(0, None)]):
+        (_, rollout), = rollouts(scene_of(jaws, obj, grasp, "carry"), jaws, grasp, workers=1)
+        laid = np.array(rollout.batch.bind("mocap_pos"))
+        for first, last in halves:
+            assert np.array_equal(rollout.batch.bind("mocap_pos"), laid)
+            rollout.close(first, last)
+        assert not np.allclose(rollout.batch.bind("mocap_pos"), laid)
+        ends.append(rollout.observe().position[0])
+    assert np.allclose(*ends, atol=1e-4)
+
+
 def test_frames_do_not_matter(jaws: Hand) -> None:
     T, extents = motion(), (0.02, 0.05, 0.02)
     outcomes = []

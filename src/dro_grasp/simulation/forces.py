@@ -63,7 +63,7 @@ def find_forces(
         obj: Their object; balls stand for a bare cloud.
         grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
         protocol: Physics of the closing.
-        config: How grasps squeeze for a weight.
+        config: How grasps squeeze for a weight; by default as usual, with the protocol's stiffness.
         weigh: Try a few masses in simulation, instead of predicting the payload: nearer to what trials say, in ten times the
             time.
         workers: Threads; all cores by default.
@@ -73,7 +73,8 @@ def find_forces(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.
     """
-    obj, config, rules = solid_of(obj), config or WeightConfig(), replace(find_protocol(protocol), gradual=True, closing=True)
+    obj, rules = solid_of(obj), replace(find_protocol(protocol), gradual=True, closing=True)
+    config = config or WeightConfig(stiffness=rules.stiffness)
     whole = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
     nothing, none = grasps.joints[:0], grasps.joints.new_zeros(0)
     parts = [GraspForces((), (), nothing, nothing, none, none)]
@@ -88,12 +89,10 @@ def find_forces(
 
 def _forces(rollout: Rollout, grasps: GraspBatch, config: WeightConfig, weigh: bool) -> GraspForces:
     """Both halves of the closing, and what is read after each."""
-    hand, begin, seen = rollout.scene.hand, rollout.start, []
-    first, middle, last = rollout.targets
-    for targets, wanted in (([first, middle], grasps.joints), ([middle, last], grasps.squeeze_joints)):
-        rollout.targets = targets
-        closed, joints = rollout.close(), torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
-        seen.append((tuple(contact_forces(rollout)), servo_torques(hand, joints, wanted, config.stiffness)))
+    hand, begin, seen, rules = rollout.scene.hand, rollout.start, [], rollout.scene.protocol
+    for first, last, wanted in ((0, 1, grasps.joints), (1, None, grasps.squeeze_joints)):
+        closed, joints = rollout.close(first, last), torch.from_numpy(rollout.poses()[0]).to(grasps.joints)
+        seen.append((tuple(contact_forces(rollout)), servo_torques(hand, joints, wanted, rules)))
     (before, weak), (after, firm) = seen
     chosen = squeezes_of(hand, list(after), joints, grasps.squeeze_joints, config)
     shift, turn = (torch.from_numpy(x).to(joints) for x in (closed.shift(begin), closed.turn(begin)))

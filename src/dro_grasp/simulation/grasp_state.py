@@ -168,7 +168,7 @@ def grasp_state_many(
     for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
         closed, state = _observed(rollout)
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
-        squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, config.stiffness), state.pressure))
+        squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, rollout.scene.protocol), state.pressure))
         parts.append(replace(state, gave=_pulled(rollout, closed, config)))
     return join(parts), join(squeezes)
 

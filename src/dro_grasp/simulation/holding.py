@@ -66,4 +66,4 @@ def rest(
         rollout.qpos[:, rollout.scene.object_qpos.start] += AWAY
     rollout.close()
     joints = torch.from_numpy(rollout.poses()[0])
-    return joints, servo_torques(hand, joints, grasps.squeeze_joints.double(), rules.stiffness)
+    return joints, servo_torques(hand, joints, grasps.squeeze_joints.double(), rules)

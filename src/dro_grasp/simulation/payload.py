@@ -21,6 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.pressure import Pressing, by_link
+from dro_grasp.simulation.protocols import Protocol
 
 GRAVITY = 9.81  # [m/s^2]
 LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
@@ -99,10 +100,17 @@ class Squeezes(Rows):
 
 
 def servo_torques(
-    hand: Hand, joints: Float[Tensor, "*n n_dof"], targets: Float[Tensor, "*n n_dof"], stiffness: float
+    hand: Hand, joints: Float[Tensor, "*n n_dof"], targets: Float[Tensor, "*n n_dof"], rules: Protocol
 ) -> Float[Tensor, "*n n_dof"]:
-    """What servos exert with the hand at these joints, within their efforts [Nm or N]."""
-    limit = find_efforts(hand).limit
+    """What the servos of a protocol's scene exert with the hand at these joints, at rest [Nm or N]."""
+    limit = find_efforts(hand).limit if rules.effort else rules.force_limit / hand.tree.joint_unit
+    return _springs(hand, joints, targets, rules.stiffness, limit)
+
+
+def _springs(
+    hand: Hand, joints: Float[Tensor, "*n n_dof"], targets: Float[Tensor, "*n n_dof"], stiffness: float,
+    limit: Float[Tensor, " n_dof"],
+) -> Float[Tensor, "*n n_dof"]:
     return ((targets - joints) * stiffness / hand.tree.joint_unit**2).clamp(-limit, limit) * hand.movable
 
 
@@ -140,7 +148,8 @@ def given_way(
     wrench, torque, hessian = generators(touch, config)
     soft = squeezes.hand.tree.joint_unit**2 / config.servo
     targets = squeezes.targets(masses.expand(n, m))
-    springs = servo_torques(squeezes.hand, squeezes.joints[:, None].expand_as(targets), targets, squeezes.stiffness)
+    joints, limit = squeezes.joints[:, None].expand_as(targets), find_efforts(squeezes.hand).limit
+    springs = _springs(squeezes.hand, joints, targets, squeezes.stiffness, limit)
     pulls = torch.as_tensor(FORCES).to(masses)
     load = GRAVITY * masses[:, None, None] * torch.cat([pulls, torch.zeros_like(pulls)], 1)
     stored = (springs * soft) @ torque

@@ -123,37 +123,42 @@ class Rollout:
         """Where tensors are that belong to many grasps."""
         return torch.device("cpu" if self.device == WARP or on_processor(self.device) else self.device)
 
-    def close(self) -> ObjectState:
+    def close(self, first: int = 0, last: int | None = None) -> ObjectState:
         """Move to the target for the protocol's closing time; a table is there until then, and gone afterwards.
 
         What has closed in the same way before, in this scene, is not simulated again.
+
+        Args:
+            first: Number of the target from which the hand moves, of those of a gradual closing.
+            last: Number of the target where it ends, with the table still there; by default the last one.
         """
-        begun, steps = self._beginnings(), self._steps(self.scene.protocol.closing_time)
+        targets = self.targets[first:None if last is None else last + 1]
+        begun, steps = self._beginnings(targets), self._steps(self.scene.protocol.closing_time)
         before = [self.scene.closings.get(key) for key in begun] if begun else [None] * self.size
         rows = np.flatnonzero([moment is None for moment in before])
         if len(self.targets) == 1:
             self._advance(rows, steps)
-        for begin, end in pairwise(self.targets):
+        for begin, end in pairwise(targets):
             for i in range(RAMP):
                 self.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
-                self._advance(rows, steps // (RAMP * (len(self.targets) - 1)))
+                self._advance(rows, steps // (RAMP * (len(targets) - 1)))
         for name in STATE:
             for row, moment in enumerate(before):
                 if moment is not None:
                     self.batch.bind(name)[row] = moment[name]
         if begun:
             self._remember({begun[row]: row for row in rows.tolist()})
-        if self.scene.table:
+        if self.scene.table and last is None:
             self.batch.bind("mocap_pos")[:] = TABLE_AWAY
             self.batch.bind("mocap_quat")[:] = [1.0, 0.0, 0.0, 0.0]  # as it is turned now, it may lie over the hand
             self.force[:] = 0.0
         return self.observe()
 
-    def _beginnings(self) -> list[bytes]:
+    def _beginnings(self, targets: Sequence[Float[np.ndarray, "n n_actuators"]]) -> list[bytes]:
         """What decides where each hand ends as it closes; nothing where more than that decides, or frames are recorded."""
         if self.altered or self.scene.table or self.stride is not None or not on_processor(self.device):
             return []
-        columns = [*(np.array(self.batch.bind(name)) for name in STATE), *self.targets]
+        columns = [*(np.array(self.batch.bind(name)) for name in STATE), *targets]
         return [b"".join(column[row].tobytes() for column in columns) for row in range(self.size)]
 
     def _remember(self, rows: dict[bytes, int]) -> None:

@@ -14,6 +14,7 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.arm.clearing.trial import ClearTrialConfig
 from dro_grasp.arm.planning.candidates import grasps_in_world
+from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal, guessed_farther
 from dro_grasp.arm.planning.planner import plan
 from dro_grasp.arm.planning.reachability import Fault, Feasible, Postures
@@ -155,6 +156,16 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     scene.advance = advance
     rehearsal.grip(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.003, 0.004])
+def test_a_trajectory_takes_its_own_time_whatever_the_time_step(robot: dro.Robot, timestep: float) -> None:
+    scene, time = LiftScene(Workcell(robot), []), np.arange(31) * 0.0095
+    scene.model.opt.timestep = timestep
+    arm, hand = np.tile(robot.home, (31, 1)), np.tile(robot.open_hand, (31, 1))
+    before = scene.data.time
+    scene.follow(Trajectory(time, arm, 0 * arm, 0 * arm), Trajectory(time, hand, 0 * hand, 0 * hand), slice(2, 31))
+    assert scene.data.time - before == pytest.approx(time[30] - time[2], abs=timestep)
 
 
 @pytest.mark.parametrize("distance", [-0.01, 0.005])

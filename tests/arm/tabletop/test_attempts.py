@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import dro_grasp as dro
 from dro_grasp.arm.planning.motion import SLIDING, MotionPlan
 from dro_grasp.arm.planning.physics import Deviation, LiftScene, object_name
 from dro_grasp.arm.planning.task import PlanConfig
-from dro_grasp.arm.planning.workcell import Workcell
+from dro_grasp.arm.planning.workcell import Workcell, moved
 from dro_grasp.arm.tabletop import experiment
 from dro_grasp.arm.tabletop.animation import Recorder, draw_animation
 from dro_grasp.arm.tabletop.attempts import Attempt
@@ -151,6 +152,47 @@ def test_an_attempt_repeats(robot: dro.Robot, can: dro.ObjectModel) -> None:
     assert (first.stage, first.raised, first.place) == (second.stage, second.raised, second.place)
 
 
+def test_a_frame_far_from_the_object_moves_nothing(robot: dro.Robot, can: dro.ObjectModel) -> None:
+    """As files of machine parts have it: the origin of their assembly."""
+    away = np.eye(4)
+    away[:3, 3] = 0.6, 0.2, 0.1
+    region, base = (0.4, -0.1, 0.45, 0.1), robot.T_world_base[:2, 3]
+    places = []
+    for obj in (can, moved(can, away)):
+        scene = LiftScene(Workcell(robot), [obj])
+        assert rest(scene, 0, region, np.random.default_rng(3))
+        places.append(scene.centre(0))
+        assert (np.array(region[:2]) - 0.05 < scene.centre(0)[:2] - base).all()
+        assert (scene.centre(0)[:2] - base < np.array(region[2:]) + 0.05).all()
+    np.testing.assert_allclose(*places, atol=5e-3)
+
+
+def test_a_turn_in_the_hand_is_no_slip(robot: dro.Robot, can: dro.ObjectModel) -> None:
+    shift = trimesh.transformations.translation_matrix
+    scene, T = LiftScene(Workcell(robot), [moved(can, shift((0.8, 0.0, 0.0)))]), shift((0.0, 0.0, 0.5))
+    scene.place(0, T)
+    where, centre = scene.centre_in_hand(0), scene.centre(0)
+    np.testing.assert_allclose(centre, scene.objects[0].centre_of_mass + T[:3, 3], atol=1e-9)
+    turn = trimesh.transformations.rotation_matrix(0.3, (0, 1, 0), centre)
+    scene.place(0, turn @ T)
+    np.testing.assert_allclose(scene.centre_in_hand(0), where, atol=1e-9)
+    in_hand = scene.in_hand(0) @ [*scene.objects[0].centre_of_mass, 1]
+    np.testing.assert_allclose(in_hand[:3], where, atol=1e-9)
+
+
+def test_attempts_with_other_objects_draw_other_places(robot: dro.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    def scattered(scene: LiftScene, region: object, draw: np.random.Generator) -> bool:
+        drawn.append(draw.uniform())
+        return False
+
+    monkeypatch.setattr(experiment, "scatter", scattered)
+    for name in ("can", "torus", "can"):
+        attempt(robot, dro.load_object(name), 0, 0, dro.GraspPredictor(), QUICK)
+    assert drawn[0] == drawn[2] != drawn[1]
+
+
 def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None:
     can, config = dro.load_object("can"), TabletopConfig(clutter=2)
     others = other_objects("can", 2, np.random.default_rng(0))
@@ -191,7 +233,7 @@ def test_a_stated_mass_is_lifted_and_planned_for(
         made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)
         assert made.reason == "not planned"
         bodies = [scenes[-1].model.body(object_name(i)).mass[0] for i in range(2)]
-        assert bodies == pytest.approx([mass or can.mass, other_objects("can", 1, np.random.default_rng([0, 0, 1]))[0].mass])
+        assert bodies == pytest.approx([mass or can.mass, scenes[-1].objects[1].mass])
         assert known[-1].stated_mass == mass
     assert solid_of(known[0]).mass == pytest.approx(0.4, rel=1e-6)
 

@@ -149,6 +149,10 @@ class LiftScene:
         T[:3, 3] = self.data.qpos[start:start + 3] - T[:3, :3] @ self._centres[index]
         return T
 
+    def centre(self, index: int) -> Float[np.ndarray, "3"]:
+        """Where an object's centre of mass is [m]: the origin of its frame may be anywhere, and sways as it turns."""
+        return self.data.body(object_name(index)).xpos.copy()
+
     def speed(self, index: int) -> float:
         """How fast an object moves, its rotation counted at 5 cm from its centre [m/s]."""
         start = int(self.model.jnt_dofadr[self.model.joint(object_name(index)).id])
@@ -157,9 +161,17 @@ class LiftScene:
 
     def in_hand(self, index: int) -> Float[np.ndarray, "4 4"]:
         """Where an object really is in the frame of the hand's root link [m]."""
+        return np.linalg.inv(self._T_world_root()) @ self.pose(index)
+
+    def centre_in_hand(self, index: int) -> Float[np.ndarray, "3"]:
+        """Where its centre of mass is in that frame [m]."""
+        T_world_root = self._T_world_root()
+        return T_world_root[:3, :3].T @ (self.centre(index) - T_world_root[:3, 3])
+
+    def _T_world_root(self) -> Float[np.ndarray, "4 4"]:
         body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
         T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
-        return np.linalg.inv(T) @ self.pose(index)
+        return T
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
         """Where arm and hand really are, in independent joints [rad or m]."""
@@ -187,9 +199,10 @@ class LiftScene:
 
     def follow(self, arm: Trajectory, hand: Trajectory, rows: slice, watch: Callable[[], None] | None = None) -> None:
         """Let the servos follow some rows of trajectories with the same times; `watch` is called once a tick."""
-        for i in range(rows.start + 1, rows.stop):
+        ends = ((arm.time[rows] - arm.time[rows.start]) / self.model.opt.timestep).round()  # each in whole steps from the start
+        for i, steps in enumerate(np.diff(ends), rows.start + 1):
             self.command(arm.position[i], arm.velocity[i], hand.position[i])
-            self.advance(float(arm.time[i] - arm.time[i - 1]), watch)
+            self.advance(steps * self.model.opt.timestep, watch)
 
     def touched(self, index: int) -> int:
         """How many links of the hand touch an object."""
@@ -309,6 +322,7 @@ class Rehearsal:
         approach = self._within(goal.approach[::-1], 0.03)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
+        low = scene.centre(0)[2]
         self._follow(scene, approach, hand.pregrasp[None], 0.3)
         self._follow(scene, approach[-1:], hand.closing, 1.0)
         self._follow(scene, approach[-1:], hand.squeeze[None], 0.3)
@@ -316,11 +330,11 @@ class Rehearsal:
             return None
         rows = self._within(goal.lift, 0.08)
         self._follow(scene, rows, hand.squeeze[None], 0.7)
-        risen, grip = scene.pose(0)[2, 3] - start[2, 3], scene.in_hand(0)
+        risen, grip = scene.centre(0)[2] - low, scene.centre_in_hand(0)
         if risen < self._lengths(rows)[-1] / 2:
             return None
         self._follow(scene, rows[-1:], hand.squeeze[None], 0.3)
-        slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
+        slip = np.linalg.norm(scene.centre_in_hand(0) - grip)
         return scene.in_hand(0) if slip < 0.02 and scene.touched(0) >= FEWEST_LINKS else None
 
     def push(self, arm: Trajectory, hand: Trajectory, rows: slice, deviation: Deviation) -> bool:
@@ -329,11 +343,10 @@ class Rehearsal:
         scene.model.opt.noslip_iterations = 0
         scene.begin(arm.position[rows.start], hand.position[rows.start])
         scene.place(0, start)
-        body = scene.data.body(object_name(0))
-        height = float(body.xpos[2])
+        height = scene.centre(0)[2]
         scene.follow(arm, hand, rows)
         scene.advance(TIPPING_SECONDS)
-        return bool(body.xpos[2] > height - FALLEN)
+        return bool(scene.centre(0)[2] > height - FALLEN)
 
     def _begin(self, deviation: Deviation) -> tuple[LiftScene, Float[np.ndarray, "4 4"]]:
         """The scene that deviates so, and where the object begins in it."""

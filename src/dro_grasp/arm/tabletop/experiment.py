@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -38,7 +39,7 @@ from dro_grasp.objects.shape import ObjectModel, check_mass, with_mass
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 
-LABEL = "tabletop/14 "
+LABEL = "tabletop/15 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 SETTLE_SECONDS = 1.0  # How long an object is left to itself before its place is measured [s] (ours)
 PUSHES = 16  # Most pushes of a flat thing towards an edge (ours)
@@ -160,14 +161,15 @@ def attempt(
     robot.require_table(camera=config.see == "cloud")
     require_mesh(obj)
     obj = obj if config.mass is None else with_mass(obj, config.mass)
-    others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
+    own = seed + zlib.crc32(obj.name.encode())  # with the same draws for all objects, attempts would not be independent
+    others = other_objects(obj.name, config.clutter, np.random.default_rng([own, number, 1]))
     scene = LiftScene(Workcell(robot), [obj, *others], friction=config.friction)
     result = Attempt(robot.name, obj.name, number, seed, config.label())
-    draw = np.random.default_rng([seed, number])
+    draw = np.random.default_rng([own, number])
     if not scatter(scene, config.region, draw):
         return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
-    start, *beside = (scene.pose(i) for i in range(len(scene.objects)))
-    result = replace(result, place=json.dumps(start.round(6).tolist()))
+    start, beside = scene.pose(0), [scene.centre(i) for i in range(1, len(scene.objects))]
+    low, result = scene.centre(0)[2], replace(result, place=json.dumps(start.round(6).tolist()))
     try:
         while True:
             result = replace(result, stage="see")
@@ -175,18 +177,18 @@ def attempt(
             seen, T = _see(scene, config, int(draw.integers(2**31)))
             see_seconds = time.perf_counter() - begin
             result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-            grasps = None if proposer is None else proposer(seen, T, seed + number)
-            place = draw_place(scene, seen, config.region, np.random.default_rng([seed, number, 2])) if config.place else None
+            grasps = None if proposer is None else proposer(seen, T, own + number)
+            place = draw_place(scene, seen, config.region, np.random.default_rng([own, number, 2])) if config.place else None
             if grasps is None and config.slide and may_slide(seen.robot, seen.obj, T):
                 made = plan_or_slide(
-                    seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, place=place)
+                    seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, own + number, place=place)
             else:
-                made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps, place=place)
+                made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, own + number, grasps, place=place)
             if made.notes.slide is None:
                 break
             if (result := _pushed(result, scene, seen, made, watch)).reason:
                 return result
-            start = scene.pose(0)
+            start, low = scene.pose(0), scene.centre(0)[2]
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -200,8 +202,8 @@ def attempt(
     if config.place and not reason:
         result = measured(result, scene, start, made)
         stage, reason = place_fault(result.place_error or 0.0, result.place_tilt or 0.0)
-    raised = float(scene.pose(0)[2, 3] - start[2, 3])
-    pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
+    raised = float(scene.centre(0)[2] - low)
+    pushed = max((float(np.linalg.norm(scene.centre(i) - centre)) for i, centre in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
@@ -216,25 +218,25 @@ def _pushed(
     for stage in SLIDING:
         scene.follow(made.arm, made.hand, made.part(stage), None if watch is None else lambda: watch.moved(scene))
     table, result = scene.robot.usual_table, replace(result, pushes=result.pushes + 1)
-    if scene.pose(0)[2, 3] < table.height - FALLEN:
+    if scene.centre(0)[2] < table.height - FALLEN:
         return replace(result, stage="slide", reason="the object fell off the table as it was pushed")
     return result
 
 
 def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:
     """Let the servos follow a plan, then hold and shake, or put down; where it ended, and why if it failed."""
-    start = scene.pose(0)
+    start = scene.centre(0)
     call = None if watch is None else lambda: watch.moved(scene)
     for stage in STAGES:
         scene.follow(made.arm, made.hand, made.part(stage), call)
-        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
+        if stage == "approach" and (moved := float(np.linalg.norm(scene.centre(0) - start))) > 0.03:  # [m] (ours)
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
-    lifted = float(scene.pose(0)[2, 3] - start[2, 3])
+    lifted = float(scene.centre(0)[2] - start[2])
     if lifted < config.plan.reach.within(scene.robot).lift / 2:
         return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
     if made.notes.place is not None:
         return _put_down(scene, made, call)
-    grip = scene.in_hand(0)
+    grip = scene.centre_in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]
     for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
         for k in range(round(seconds / TICK)):
@@ -250,16 +252,16 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
     return "done", ""
 
 
-def _slipped(scene: LiftScene, grip: Float[np.ndarray, "4 4"]) -> str:
-    """How far the object has moved in the hand since it was held there, if that is too far."""
-    slip = _apart(scene.in_hand(0), grip)
+def _slipped(scene: LiftScene, grip: Float[np.ndarray, "3"]) -> str:
+    """How far the object has moved in the hand since its centre of mass was there [m], if that is too far."""
+    slip = float(np.linalg.norm(scene.centre_in_hand(0) - grip))
     lost = slip > 0.05 or not scene.touched(0)  # [m] (ours)
     return f"the object slipped by {100 * slip:.0f} cm out of the hand" if lost else ""
 
 
 def _put_down(scene: LiftScene, made: MotionPlan, call: Callable[[], None] | None) -> tuple[str, str]:
     """Let the servos follow the stages after the lift, and wait; where it ended, and why if it failed."""
-    grip = scene.in_hand(0)
+    grip = scene.centre_in_hand(0)
     for stage in PLACING:
         scene.follow(made.arm, made.hand, made.part(stage), call)
         if stage == "carry" and (slipped := _slipped(scene, grip)):
@@ -282,10 +284,6 @@ def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObj
     else:
         seen = pick_object(view, robot, T[:3, :3] @ obj.cloud.mean(0) + T[:3, 3])
     return seen if config.mass is None else replace(seen, obj=with_mass(seen.obj, config.mass)), np.eye(4)
-
-
-def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
-    return float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
 
 
 def require_mesh(obj: ObjectModel) -> None:

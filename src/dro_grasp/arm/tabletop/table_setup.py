@@ -38,7 +38,7 @@ def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator
         generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
         T = np.eye(4)
         T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
-        T[:2, 3] = _free_place(scene, index, T, region, draw, apart)
+        T[:2, 3] = _free_place(scene, index, T[:3, :3], region, draw, apart)
         T[2, 3] = table.height + 0.005 - float((obj.vertices @ T[2, :3]).min())
         scene.place(index, T)
         resting = False
@@ -46,17 +46,21 @@ def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator
             scene.advance(0.5)
             if resting := scene.speed(index) < 0.002:
                 break
-        place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
+        place = scene.centre(index)[:2] - scene.robot.T_world_base[:2, 3]
         if resting and (place > low - 0.05).all() and (place < high + 0.05).all():
             return True
     return False
 
 
 def _free_place(
-    scene: LiftScene, index: int, T: Float[np.ndarray, "4 4"], region: Region, draw: np.random.Generator, apart: float,
+    scene: LiftScene, index: int, R: Float[np.ndarray, "3 3"], region: Region, draw: np.random.Generator, apart: float,
 ) -> Float[np.ndarray, "2"]:
-    """Where an object in this orientation stands so far apart [m] from those before it, or else the farthest place tried."""
-    base, outline = scene.robot.T_world_base[:2, 3], scene.objects[index].cloud @ T[:2, :3].T
+    """Where the origin of an object is that stands so far from those before it [m], or as far as any place that was tried.
+
+    Its centre of mass is in the region.
+    """
+    base, obj = scene.robot.T_world_base[:2, 3], scene.objects[index]
+    outline, offset = (obj.cloud - obj.centre_of_mass) @ R[:2].T, R[:2] @ obj.centre_of_mass
     poses = [scene.pose(i) for i in range(index)]
     others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
     tree, best = KDTree(np.concatenate(others)) if others else None, (-1.0, base)
@@ -67,4 +71,4 @@ def _free_place(
             best = distance, place
         if distance > apart:
             break
-    return best[1]
+    return best[1] - offset

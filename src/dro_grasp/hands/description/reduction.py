@@ -179,7 +179,7 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
         first = wraps[0]
         for other in wraps[1:]:
             tied = last_leader(other.target.name) == last_leader(first.target.name)
-            if tied or other.target.name in leader or abs(other.coef) < 1e-9:
+            if tied or other.target.name in leader or abs(other.coef) < SLACK:
                 continue
             leader[other.target.name] = first.target.name
             equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=other.target.name, name2=first.target.name,
@@ -285,6 +285,7 @@ def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 Joints = Float[np.ndarray, " n"]  # a value of each joint
 Sweeps = dict[int, Float[np.ndarray, "_ n"]]  # by leader, joint values while it goes through its range
+SLACK = 1e-9  # Coefficient below which a tendon does not pull at a joint [m/rad or 1] (ours)
 CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
 STEPS = 32  # Steps from one end of a leader's range to the other (ours)
 SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)
@@ -316,8 +317,10 @@ def _limit_joints_as_actuators(spec: mujoco.MjSpec) -> None:
             continue
         shares = {actuator.target: float(np.abs(actuator.gear[:3]).max())}  # a ball's gear has three numbers
         if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON and actuator.target in tendons:
-            shares = {w.target.name: abs(w.coef * actuator.gear[0]) for w in tendons[actuator.target].path
-                      if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None}
+            wraps = [w for w in tendons[actuator.target].path
+                     if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None and abs(w.coef) >= SLACK]
+            # Whichever joint leads the others does the work of all: by one length of the tendon, it works as much at each.
+            shares = {w.target.name: len(wraps) * abs(w.coef * actuator.gear[0]) for w in wraps}
         for name, share in shares.items():
             if name in joints and share and joints[name].actfrclimited != mujoco.mjtLimited.mjLIMITED_TRUE:
                 joints[name].actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE

@@ -65,12 +65,13 @@ class KinematicTree:
 
     @cached_tensor
     def joint_unit(self) -> Float[Tensor, " n_dof"]:
-        """Motion of each independent joint that counts as 1 rad: 1 rad where it turns links, SLIDING_UNIT where it slides."""
-        turns = torch.zeros(self.n_dof, dtype=torch.bool, device=self.origin.device)
-        for kind, joint in zip(self.kind, self.link_joint, strict=True):
-            if kind == REVOLUTE:
-                turns |= self.coupling[joint] != 0
-        return torch.where(turns, 1.0, SLIDING_UNIT).to(self.origin)
+        """Motion of each independent joint that counts as 1 rad: 1 rad where it turns itself, SLIDING_UNIT where it slides.
+
+        The kind of its followers does not count: a slide that turns fingers by rods has a servo of forces.
+        """
+        kinds = zip(self.link_joint, self.kind, strict=True)
+        sliding = {self.moving_names[joint] for joint, kind in kinds if kind == PRISMATIC}
+        return self.origin.new_tensor([SLIDING_UNIT if name in sliding else 1.0 for name in self.joint_names])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> KinematicTree:
         """The same tree with its tensors on another device or in another precision."""
