@@ -48,9 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="only print the commands")
     options = parser.parse_args(argv)
     device = choose_device(options.device)
+    if "weights" in options.stages and not (options.tiny or options.list) and commit().endswith("+"):
+        print("weights state the commit of the code that makes them; commit your changes first, and leave the code as it is "
+              "until they are done, for instance in a worktree of its own", file=sys.stderr)
+        return 2
     for stage in options.stages:
         for step in STAGES[stage](TINY if options.tiny else FULL, options.folder):
-            made = Attempt(step, options.folder, options.workers, device, options.minutes)
+            made = Attempt(step, options.folder, options.workers, device, options.minutes, options.tiny)
             if options.list:
                 print(made.told())
             elif code := made.run():
@@ -67,8 +71,11 @@ def end_with_parent() -> None:
 class Attempt:
     """A step with the options of this run."""
 
-    def __init__(self, step: Step, folder: str, workers: int, device: str, minutes: float | None) -> None:
-        self.step, self.record = step, ROOT / folder / RECORD
+    def __init__(
+        self, step: Step, folder: str, workers: int, device: str, minutes: float | None, changed: bool = False
+    ) -> None:
+        """`changed` takes what code made that no commit holds."""
+        self.step, self.record, self.changed = step, ROOT / folder / RECORD, changed
         self.workers, self.device, self.minutes = workers, device, minutes
         self.command = step.command.replace("{folder}", folder)
         self.read = fingerprint(ROOT / path for path in step.reads) if all((ROOT / p).exists() for p in step.reads) else ""
@@ -92,10 +99,11 @@ class Attempt:
         return in_words("python", *self.words()[1:]).replace("python -m dro_grasp ", "dro-grasp ")
 
     def done(self) -> bool:
-        """Whether it was run to its end, by the same command on the same files."""
+        """Whether it was run to its end, by the same command on the same files, with code that a commit holds."""
         known = self._known().get(self.step.name, {})
         return bool(self.step.makes) and (ROOT / self.step.makes).exists() and (
-            known.get("command"), known.get("read")) == (self.command, self.read)
+            known.get("command"), known.get("read")) == (self.command, self.read) and (
+            self.changed or not known.get("commit", "").endswith("+"))
 
     def run(self) -> int:
         """Run it, unless it is done; its exit code."""

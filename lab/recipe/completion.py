@@ -214,6 +214,8 @@ def collect(shapes: int, given: tuple[str, int]) -> tuple[tuple[Tensor, ...], st
         for kind, sides in SIDES.items():
             ups = [resting(obj, rng) if rng.uniform() < RESTING else np.eye(3)[2] for _ in range(sides)]
             found += [view for view in (view_of(obj, kind, up, rng) for up in ups) if view is not None]
+    if not found:
+        raise ValueError(f"nothing is seen of {label}")
     return tuple(torch.stack(column) for column in zip(*found, strict=True)), f"{len(found)} views"
 
 

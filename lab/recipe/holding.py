@@ -27,12 +27,12 @@ from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
 from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.variants import vary_hand
-from dro_grasp.network.checkpoints import load_weights, save_weights
+from dro_grasp.network.checkpoints import load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import SHIPPED_HOLDING, Evidence, HoldingScore, holding_features
-from dro_grasp.predict.score.score import ScoreConfig
+from dro_grasp.predict.score.score import SHIPPED, ScoreConfig
 from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
@@ -41,7 +41,7 @@ from dro_grasp.provenance import made_by
 from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.made_hands.making import make_hand
-from lab.recipe.parts import fill, fingerprint
+from lab.recipe.parts import checksum, fill, fingerprint
 from lab.recipe.ranking import HANDS
 
 TRIALS = ("carry", "robust")
@@ -316,6 +316,7 @@ def main() -> None:
     settings = asdict(plan) | {"ranking": str(plan.ranking or "shipped")}
     about = {
         "stage": "ranking of settled grasps", **made_by(), "settings": settings, "trials": TRIALS, "seed": SEED,
+        "rests_on": {"weights": checksum(locate_weights(options.weights)), "ranking": checksum(plan.ranking or SHIPPED)},
         "samples": STEPS * len(rows.hand), "metrics": found,
         "data": {"hands": dict(Counter(rows.hand)), "grasps": len(rows.hand), "pairs": int(rows.pair.max()) + 1,
                  "fingerprint": fingerprint(sorted(options.folder.glob("*.pt")))},

@@ -29,11 +29,14 @@ def missing(path: Path, changed: bool) -> list[str]:
     """What a file does not say of how it was made; `changed` lets a commit pass whose code was changed."""
     if not path.is_file():
         return ["the file"]
-    about: dict[str, Any] = (history_of(path) or [{}])[-1]
+    history: list[dict[str, Any]] = history_of(path) or [{}]
+    about = history[-1]
     lacking = [name for name in STATED if not about.get(name) and not (name == "commit" and changed)]
     lacking += [] if about.get("data", {}).get("fingerprint") else ["data.fingerprint"]
-    if not changed and str(about.get("commit", "")).endswith("+"):
+    if not changed and any(str(stage.get("commit", "")).endswith("+") for stage in history):
         lacking.append("a commit without changes")
+    if any(" /" in str(stage.get("command", "")) for stage in history):
+        lacking.append("a command without paths of this machine (run the recipe with a relative --folder)")
     return lacking
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from dro_grasp.training.data.engine.worker import FinishedShard
 
 LIMIT = 3600.0
 """Longest time that a file may take [s]."""
+FEW = 0.03
+"""Share of the files that may fail."""
 Task = tuple[Path, Any]
 """The file to make, and of what."""
 Make = Callable[[Any, Any], tuple[Any, str]]
@@ -27,11 +30,13 @@ Make = Callable[[Any, Any], tuple[Any, str]]
 def fill(make: Make, shared: Any, tasks: Iterable[Task], workers: int = 1, minutes: float = math.inf) -> None:
     """Make the files that are missing in so many processes; no new one is begun when the time is over.
 
-    One that fails is told and left out; the next run tries it again.
+    One that fails is told and tried once more. The run ends with exit code 1 where more than FEW of the files failed twice;
+    the next run tries these again.
     """
-    end, missing = time.monotonic() + 60 * minutes, [task for task in tasks if not task[0].exists()]
+    every = list(tasks)
+    end, missing = time.monotonic() + 60 * minutes, {path: given for path, given in every if not path.exists()}
     pool = LocalPool((make, shared), max(1, min(workers, len(missing))), LIMIT, _write)
-    flying, waiting = 0, list(reversed(missing))
+    flying, waiting, failed = 0, list(reversed(missing.items())), Counter[Path]()
     try:
         while waiting or flying:
             while waiting and pool.free and time.monotonic() < end:
@@ -39,11 +44,17 @@ def fill(make: Make, shared: Any, tasks: Iterable[Task], workers: int = 1, minut
                 flying += 1
             if not flying:
                 break
-            for (path, _), told in pool.wait(60.0):
+            for (path, given), told in pool.wait(60.0):
                 flying -= 1
                 print(f"{path.stem}: {told.reason if isinstance(told, Failed) else told.payload.decode()}", flush=True)
+                if isinstance(told, Failed):
+                    failed[path] += 1
+                    waiting += [(path, given)] if failed[path] == 1 else []
     finally:
         pool.close()
+    lost = [path.stem for path, times in failed.items() if times > 1]
+    if len(lost) > FEW * len(every):
+        raise SystemExit(f"{len(lost)} of {len(every)} failed twice, such as {lost[0]}; see why above, and run it again")
 
 
 def _write(job: tuple[Make, Any], task: Task) -> FinishedShard:
@@ -54,6 +65,11 @@ def _write(job: tuple[Make, Any], task: Task) -> FinishedShard:
     with replacing(path) as temporary:
         torch.save(content, temporary)
     return FinishedShard(Shard(path.stem, "", 0), f"{told}, {time.monotonic() - begin:.0f} s".encode(), Yield())
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def fingerprint(paths: Iterable[Path]) -> str:

@@ -11,6 +11,7 @@ lowest loss on objects left out is written. Assets are needed where hands or obj
 from __future__ import annotations
 
 import argparse
+import math
 import random
 from collections import Counter
 from collections.abc import Sequence
@@ -28,7 +29,8 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.network.checkpoints import DEFAULT, load_weights
+from dro_grasp.network.checkpoints import DEFAULT, load_weights, locate_weights
+from dro_grasp.network.completion_network import SHIPPED as SHIPPED_SURFACE, load_surface
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel
@@ -42,7 +44,7 @@ from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
 from dro_grasp.provenance import made_by
 from dro_grasp.simulation.trial import simulate
-from lab.recipe.parts import fill, fingerprint
+from lab.recipe.parts import checksum, fill, fingerprint
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
          "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
@@ -58,7 +60,7 @@ TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
 SHAKE = (0.01, 0.15, 0.2)
 """Standard deviations of a shaken grasp's shift [m], turn [rad] and joints [rad], times a number up to 2."""
 LEFT_OUT = 6
-"""Training objects left out of the fit, at most a third of them, which select its best step."""
+"""One in so many training objects is left out of the fit; these select its best step."""
 STEPS = 4000
 """Steps of the fit."""
 SETTLED_WEIGHT = 3.0
@@ -102,7 +104,7 @@ def evaluated(
     """Features of grasps from the known part of the object, and outcomes of their trials on the whole object."""
     energy = GraspEnergy.of_object(hand, known, ScoreConfig().energy)
     features = grasp_features(energy, grasps, energy(grasps.T_object_wrist, grasps.joints).terms)
-    outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in trials], 1)
+    outcomes = torch.stack([simulate(hand, obj, grasps, rules, another=True).success for rules in trials], 1)
     return {**features._asdict(), "outcomes": outcomes.float()}
 
 
@@ -111,6 +113,7 @@ class Plan:
     """What is collected of each hand."""
 
     weights: str | None  # that predict the grasps
+    surface: Path  # weights that complete what is seen in part
     groups: tuple[str, ...]  # of objects
     objects: int  # of each hand
     num: int  # predicted grasps of each
@@ -119,36 +122,40 @@ class Plan:
     seed: int
 
 
-def collect(plan: Plan, name: str) -> tuple[list[dict[str, Any]], str]:
-    """Trials of one hand on some training objects, and what to print of them."""
-    hand, rng, num, network = load_hand(name), random.Random(f"{name} {plan.seed}"), plan.num, load_weights(plan.weights)
-    generator, parts = torch.Generator().manual_seed(plan.seed), list[dict[str, Any]]()
+def drawn(plan: Plan, name: str) -> list[str]:
+    """The objects of a hand."""
     labels = resolve_objects(list(plan.groups))
-    for label in rng.sample(labels, min(plan.objects, len(labels))):
-        obj = load_object(label)
-        config = ProposalConfig(temperature=rng.choice(TEMPERATURES))
-        view = rng.choice(plan.views)
-        known = partial_view(obj, view, rng.randrange(10**6))
-        problem = GraspProblem(hand, known)
-        # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
-        proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
-        raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
-        best = refine(problem, OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps)
-        # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
-        whole = GraspProblem(hand, obj)
-        closed = {kind: settle_grasps(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
-        some = refined[slice(0, num // 8)]
-        opened = hand.canonical_joints(1.0).expand_as(some.joints)
-        groups = {
-            "raw": raw[slice(0, num // 8)], "refined": refined[slice(0, num // 2)], "optimised": best[slice(0, num // 2)],
-            **{kind: found.grasps[found.stable] for kind, found in closed.items()},
-            "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
-            "opened": some.with_poses(some.T_object_wrist, opened), "away": away(some, generator),
-        }
-        about = {"hand": hand.name, "object": label, "view": view}
-        parts += [{**about, "kind": kind, **evaluated(hand, obj, grasps, known, plan.trials)}
-                  for kind, grasps in groups.items() if len(grasps)]  # all optimised ones may have lost the object
-    return parts, f"{sum(len(part['whole']) for part in parts)} grasps"
+    return random.Random(f"{name} {plan.seed}").sample(labels, min(plan.objects, len(labels)))
+
+
+def collect(plan: Plan, given: tuple[str, str]) -> tuple[list[dict[str, Any]], str]:
+    """Trials of a hand on a training object, given by their names, and what to print of them."""
+    name, label = given
+    hand, obj, rng = load_hand(name), load_object(label), random.Random(f"{name} {label} {plan.seed}")
+    num, generator = plan.num, torch.Generator().manual_seed(rng.randrange(10**6))
+    config = ProposalConfig(temperature=rng.choice(TEMPERATURES))
+    view = rng.choice(plan.views)
+    known = partial_view(obj, view, rng.randrange(10**6), network=load_surface(plan.surface))
+    problem = GraspProblem(hand, known)
+    # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
+    proposal = propose(problem, load_weights(plan.weights), num, generator, config=config)
+    raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
+    best = refine(problem, OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps)
+    # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
+    whole = GraspProblem(hand, obj)
+    closed = {kind: settle_grasps(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
+    some = refined[slice(0, num // 8)]
+    opened = hand.canonical_joints(1.0).expand_as(some.joints)
+    groups = {
+        "raw": raw[slice(0, num // 8)], "refined": refined[slice(0, num // 2)], "optimised": best[slice(0, num // 2)],
+        **{kind: found.grasps[found.stable] for kind, found in closed.items()},
+        "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
+        "opened": some.with_poses(some.T_object_wrist, opened), "away": away(some, generator),
+    }
+    about = {"hand": hand.name, "object": label, "view": view}
+    parts = [{**about, "kind": kind, **evaluated(hand, obj, grasps, known, plan.trials)}
+             for kind, grasps in groups.items() if len(grasps)]  # all optimised ones may have lost the object
+    return parts, f"{view} view, {sum(len(part['whole']) for part in parts)} grasps"
 
 
 def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
@@ -211,6 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="folder for the trials")
     parser.add_argument("--weights", default=None, help="weights that predict the grasps; the shipped ones by default")
+    parser.add_argument("--surface", type=Path, default=SHIPPED_SURFACE, help="weights that complete what is seen in part")
     parser.add_argument("--output", type=Path, default=SHIPPED, help="where the network is written")
     parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect trials of")
     parser.add_argument("--groups", nargs="+", default=list(GROUPS), help="training objects")
@@ -226,22 +234,24 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.folder.mkdir(parents=True, exist_ok=True)
-    plan = Plan(options.weights, tuple(options.groups), options.objects, options.num, tuple(options.views),
+    plan = Plan(options.weights, options.surface, tuple(options.groups), options.objects, options.num, tuple(options.views),
                 tuple(options.trials), options.seed)
     stems = {name: Path(name).stem if Path(name).suffix else name.replace("/", "-") for name in options.hands}
-    fill(collect, plan, [(options.folder / f"{stem}-{plan.seed}-{FEATURES}.pt", name) for name, stem in stems.items()],
-         options.workers)
+    fill(collect, plan, [(options.folder / f"{stem}-{label.replace('/', '-')}-{plan.seed}-{FEATURES}.pt", (name, label))
+                         for name, stem in stems.items() for label in drawn(plan, name)], options.workers)
     if options.collect_only:
         return
     files = sorted(options.folder.glob(f"*-{FEATURES}.pt"))
     parts = [part for path in files for part in torch.load(path, weights_only=True)]
     names = sorted({part["object"] for part in parts})
-    left_out = set(random.Random(0).sample(names, min(LEFT_OUT, max(1, len(names) // 3))))
+    left_out = set(random.Random(0).sample(names, math.ceil(len(names) / LEFT_OUT)))
     network, found, loss = fit(parts, left_out, plan.seed, options.steps)
     print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
           + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(plan.trials, found, strict=True)))
     about = {
-        "stage": "ranking", **made_by(), "weights": options.weights or DEFAULT, "settings": asdict(plan),
+        "stage": "ranking", **made_by(), "weights": options.weights or DEFAULT,
+        "settings": asdict(plan) | {"surface": str(plan.surface)},
+        "rests_on": {"weights": checksum(locate_weights(options.weights)), "surface": checksum(plan.surface)},
         "steps": options.steps, "trials": plan.trials, "seed": plan.seed, "left_out": sorted(left_out),
         "samples": BATCH * options.steps, "metrics": {"loss": loss, "areas": dict(zip(plan.trials, found, strict=True))},
         "data": {"hands": dict(Counter(p["hand"] for p in parts for _ in p["whole"])), "objects": len(names),

@@ -77,7 +77,7 @@ TINY = Size(
     part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", most_shipped=6, per_pair=6,
     pretraining="--preset slim --steps 4 --motion-steps 4",
     training="--preset slim --steps 8 --shards 2 --samples-per-hand 2 --validation-samples 10", placement="--steps 4",
-    ranking="--groups can torus sphere --objects 2 --num 8 --trials carry --views whole --steps 100",
+    ranking="--groups can torus sphere --objects 2 --num 8 --trials carry --views half depth --steps 100",
     holding="--groups can torus --made 1 --rounds 1 --num 8", completion="--objects can torus sphere --shapes 1 --steps 60",
     into="{folder}/weights/shipped")
 RANKED = 40
@@ -153,13 +153,14 @@ def weights(size: Size, folder: str) -> list[Step]:
                checked),
         trains("placement", f"train --part placement {size.placement} --initial {trained} --validation {checked}"
                f"{' --validation-samples 10' if size is TINY else ''}", network, trained, checked, processes=False),
-        Step("ranking", f"python -m lab.recipe.ranking --folder {{run}} --weights {network} --output {quality} "
-             f"--hands {' '.join(size.hands)} {made} {size.ranking} {seed}", quality, (network,), "--workers {workers}"),
+        Step("completion", f"python -m lab.recipe.completion --folder {{run}} --output {surface} {size.completion} {seed}",
+             surface, free="--workers {workers}"),
+        Step("ranking", f"python -m lab.recipe.ranking --folder {{run}} --weights {network} --surface {surface} "
+             f"--output {quality} --hands {' '.join(size.hands)} {made} {size.ranking} {seed}", quality, (network, surface),
+             "--workers {workers}"),
         Step("holding", f"python -m lab.recipe.holding --folder {{run}} --weights {network} --ranking {quality} "
              f"--output {holding} --hands {' '.join(size.hands)} {size.holding}", holding, (network, quality),
              "--workers {workers}"),
-        Step("completion", f"python -m lab.recipe.completion --folder {{run}} --output {surface} {size.completion} {seed}",
-             surface, free="--workers {workers}"),
         Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{' --changed' if size is TINY else ''}"),
     ]
 

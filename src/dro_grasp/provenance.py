@@ -26,11 +26,17 @@ def this_command() -> str:
 
 
 def commit() -> str:
-    """The commit of the clone that the package lies in, `+` behind it where its code is changed; empty without a clone."""
+    """The commit of the clone that the package lies in; empty without a clone.
+
+    There is `+` behind it where the package's code is changed, or that of a script of the clone that runs now.
+    """
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    beside = [] if script is None else [Path(script).resolve().parent]
     try:
         head = _git("rev-parse", "HEAD")[:10]
         _git("ls-files", "--error-unmatch", "--", __file__)  # fails where the package was copied into a clone of something else
-        changed = _git("status", "-s", "-uno", "--", ".")
+        root = Path(_git("rev-parse", "--show-toplevel"))
+        changed = _git("status", "-s", "-uno", "--", ".", *(str(folder) for folder in beside if folder.is_relative_to(root)))
     except (OSError, subprocess.SubprocessError):
         return ""
     return head + ("+" if changed else "")

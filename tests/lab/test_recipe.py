@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,12 +12,15 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
-from dro_grasp.network.checkpoints import CHECKSUMS, history_of
+from dro_grasp.network.checkpoints import CHECKSUMS, history_of, save_weights
+from dro_grasp.network.completion_network import SHIPPED as SHIPPED_SURFACE
 from dro_grasp.objects.catalogue import resolve_objects
+from dro_grasp.objects.perception.partial_views import View
 from dro_grasp.training.data.engine.schedule import own_pairs
 from lab.benchmarks.report import ROOT
-from lab.recipe import __main__ as recipe, pack
+from lab.recipe import __main__ as recipe, pack, ranking
 from lab.recipe.__main__ import Attempt
 from lab.recipe.parts import fill, fingerprint
 from lab.recipe.steps import FULL, STAGES, TINY, Step
@@ -25,8 +29,8 @@ from tests.helpers.weights import untrained_weights
 RUN = [sys.executable, "-m", "lab.recipe", *STAGES, "--tiny", "--device", "cpu", "--workers", "2", "--folder"]
 
 
-def attempt(folder: Path, command: str, makes: Path, *reads: Path) -> Attempt:
-    return Attempt(Step("one", command, str(makes), tuple(map(str, reads))), str(folder), 1, "cpu", None)
+def attempt(folder: Path, command: str, makes: Path, *reads: Path, changed: bool = True) -> Attempt:
+    return Attempt(Step("one", command, str(makes), tuple(map(str, reads))), str(folder), 1, "cpu", None, changed)
 
 
 def test_a_step_is_run_once_and_again_for_another_command_or_other_files(tmp_path: Path) -> None:
@@ -60,6 +64,27 @@ def test_a_step_that_fails_ends_the_run_with_its_code_and_is_not_done(tmp_path: 
     assert not step.done()
 
 
+def test_what_uncommitted_code_made_is_made_again(tmp_path: Path) -> None:
+    made, step = tmp_path / "made", "python -c 'pass'"
+    made.touch()
+    assert attempt(tmp_path, step, made).run() == 0
+    record = tmp_path / recipe.RECORD
+    for commit, done in (("0123456789", True), ("0123456789+", False)):
+        known = json.loads(record.read_text())
+        known["one"]["commit"] = commit
+        record.write_text(json.dumps(known))
+        assert attempt(tmp_path, step, made, changed=False).done() == done
+
+
+def test_weights_are_not_begun_with_uncommitted_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(recipe, "commit", lambda: "0123456789+")
+    assert recipe.main(["weights", "--folder", str(tmp_path), "--device", "cpu"]) == 2
+    assert "commit your changes first" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("size", [FULL, TINY])
 def test_each_step_names_a_seed_or_draws_nothing(size) -> None:
     steps = [step for stage in STAGES.values() for step in stage(size, "out")]
@@ -74,13 +99,17 @@ def test_the_data_are_what_a_release_asks_for() -> None:
     assert len(FULL.hands) == 10
     assert FULL.made >= 100
     assert {"assets:train", "builtin:train", "builtin:hard_train"} <= set(FULL.known)
-    first, last = map(int, FULL.procedural.removeprefix("procedural:").split("-"))
-    assert last - first + 1 >= 400
+    drawn = resolve_objects(FULL.procedural.split())
+    assert len(set(drawn)) >= 400
+    # Settings are chosen on these: neither weights nor scores may know them.
+    learned = {*drawn, *(name for step in (FULL.ranking, FULL.holding, FULL.completion)
+                         for group in re.findall(r"procedural:[-0-9]+", step) for name in resolve_objects([group]))}
+    assert not learned & set(resolve_objects(["procedural:200-299"]))
     assert sum(step.share for step in STAGES["data"](FULL, "out")) == pytest.approx(1)
 
 
 def test_made_up_hands_share_all_objects_among_them() -> None:
-    objects = resolve_objects([*(name for name in FULL.known if not name.startswith("assets")), FULL.procedural])
+    objects = resolve_objects([*(name for name in FULL.known if not name.startswith("assets")), *FULL.procedural.split()])
     for more in ([], [f"asset {k}" for k in range(48)]):  # the paper's training objects, where they are at hand
         part, parts = map(int, FULL.part.split("/"))
         pairs = own_pairs([str(k) for k in range(FULL.made)], [*more, *objects], (part, parts))
@@ -95,16 +124,17 @@ def make(shared: int, given: int) -> tuple[int, str]:
 
 
 def test_parts_are_made_whole_once_and_one_that_fails_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import torch
-
-    tasks = [(tmp_path / f"{k}.pt", k) for k in range(4)]
+    tasks = [(tmp_path / f"{k}.pt", k) for k in range(40)]
     (tmp_path / "3.pt").write_text("kept")
-    fill(make, 10, tasks, workers=2)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.pt", "1.pt", "3.pt"]
+    fill(make, 10, tasks, workers=2)  # one of forty is few
+    assert {p.stem for p in tmp_path.iterdir()} == {str(k) for k in range(40)} - {"2"}
     assert torch.load(tmp_path / "1.pt") == 11
+    assert (tmp_path / "3.pt").read_text() == "kept"
     told = capsys.readouterr().out
-    assert "2: ValueError: two is refused" in told
+    assert told.count("2: ValueError: two is refused") == 2
     assert "1: made 1, 0 s" in told
+    with pytest.raises(SystemExit, match="1 of 4 failed twice, such as 2"):
+        fill(make, 10, tasks[:4], workers=2)
 
 
 def test_weights_that_do_not_say_how_they_were_made_do_not_ship(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,3 +176,25 @@ def test_the_whole_recipe_survives_a_kill_in_each_step(tmp_path: Path) -> None:
         assert about["samples"] > 0
         assert about["command"].startswith(("dro-grasp train", "python -m lab.recipe."))
         assert about["metrics"]
+
+
+@pytest.mark.parametrize("view", ["half", "depth"])
+def test_grasps_on_what_was_seen_in_part_are_tried_on_the_whole_object(view: View) -> None:
+    plan = ranking.Plan(None, SHIPPED_SURFACE, ("can",), 1, 8, (view,), ("carry",), 0)
+    parts, told = ranking.collect(plan, ("gripper3", "can"))
+    assert told.startswith(f"{view} view")
+    assert {part["view"] for part in parts} == {view}
+    assert {"raw", "refined", "shaken"} <= {part["kind"] for part in parts}
+    assert all(part["outcomes"].shape == (len(part["whole"]), 1) for part in parts)
+
+
+def test_one_stage_of_a_changed_commit_or_a_path_of_this_machine_does_not_ship(tmp_path: Path) -> None:
+    whole = {"stage": "training", "command": "dro-grasp train --bundle out/a", "commit": "0123456789", "version": "1",
+             "samples": 1, "metrics": {"loss": 1.0}, "data": {"fingerprint": "f"}}
+    for number, (changes, lacking) in enumerate((
+            ({}, []), ({"commit": "0123456789+"}, ["a commit without changes"]),
+            ({"command": "dro-grasp train --bundle /tmp/a"}, ["a command without paths of this machine"]))):
+        path = tmp_path / f"{number}.safetensors"
+        save_weights(torch.nn.Linear(1, 1), path, whole, [whole | changes])
+        found = pack.missing(path, changed=False)
+        assert [text.split(" (")[0] for text in found] == lacking

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -73,11 +74,11 @@ class SurfaceNetwork(nn.Module):
 
 
 @cache
-def shipped_surface() -> SurfaceNetwork:
-    """The network that ships, loaded once."""
+def load_surface(path: Path = SHIPPED) -> SurfaceNetwork:
+    """The network of a file, by default the one that ships, loaded once."""
     def sized(tensors: dict[str, Num[Tensor, "..."]]) -> SurfaceNetwork:
         width, features = tensors["enter.weight"].shape
         depth = sum(name.startswith("layers.") and name.endswith(".0.weight") for name in tensors)
         return SurfaceNetwork(len(tensors["leave.bias"]) - 1, features - 6, width, depth, len(tensors["films.0.bias"]))
 
-    return load_small(SHIPPED, sized, "the network that completes surfaces; install the package again")
+    return load_small(path, sized, "the network that completes surfaces; install the package again")

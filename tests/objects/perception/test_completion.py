@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.network.completion_network import SurfaceFeatures, SurfaceNetwork, shipped_surface
+from dro_grasp.network.completion_network import SurfaceFeatures, SurfaceNetwork, load_surface
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.completion import GUESSES, complete_cloud, surface_features, to_view_axes
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
@@ -219,7 +219,7 @@ def test_a_camera_straight_above_knows_no_up_in_its_image() -> None:
 
 def test_the_network_sees_the_whole_side_and_no_order_of_its_points() -> None:
     torch.manual_seed(0)
-    network = shipped_surface()
+    network = load_surface()
     normals = torch.nn.functional.normalize(torch.randn(2, 60, 3), dim=-1)
     told = SurfaceFeatures(
         0.01 * torch.randn(2, 7, GUESSES), torch.randn(2, 7, FEATURES), 0.03 * torch.randn(2, 7, 3),
@@ -245,7 +245,7 @@ def test_the_network_is_nearer_to_unseen_surfaces_than_symmetry() -> None:
 
 
 def test_the_network_that_ships_is_one_of_these_features() -> None:
-    network = shipped_surface()
+    network = load_surface()
     assert network.guesses == GUESSES
     assert not network.training
     with torch.no_grad():

@@ -136,3 +136,9 @@ def test_the_page_can_be_made_of_a_hand_without_any_grasp(pairs, tmp_path):
 
     write_report(measure_coverage(pairs[1:]), Path(tmp_path / "none.html"))
     assert "lost" in (tmp_path / "none.html").read_text()
+
+
+def test_a_hand_by_file_without_any_grasp_ends_no_report(pairs):
+    """Only grasps name their hand's file."""
+    unknown = [replace(pair, grasps=replace(pair.grasps, hand="hand_00100")) for pair in pairs[1:]]
+    assert [found.hand.name for found in measure_coverage([*pairs, *unknown])] == [pairs[0].hand]

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from dro_grasp.geometry.point_clouds import one_per_cell
-from dro_grasp.network.completion_network import UNIT, SurfaceFeatures, SurfaceNetwork, shipped_surface
+from dro_grasp.network.completion_network import UNIT, SurfaceFeatures, SurfaceNetwork, load_surface
 from dro_grasp.objects.perception.resting import set_down
 from dro_grasp.objects.surface_distances import cloud_distances
 
@@ -224,7 +224,7 @@ def complete_cloud(
     if side.width < THINNEST:
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(GUESSES)
-    surface, outward = extract_surface(side, guesses, network or shipped_surface())
+    surface, outward = extract_surface(side, guesses, network or load_surface())
     # One visible point is kept per cube of a fortieth of the width, but not below 2 mm or a tenth of the width (ours).
     apart = max(side.width / 40, min(0.002, side.width / 10))
     first = one_per_cell(side.points, apart)

@@ -15,6 +15,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.kinds import Checked
+from dro_grasp.network.completion_network import SurfaceNetwork
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.perception.completion import complete_cloud
 from dro_grasp.objects.perception.depth_noise import DepthView, NoiseName, depth_noise, measured_depth
@@ -26,12 +27,14 @@ View = Literal["whole", "cloud", "half", "depth"]
 POINTS = 1024  # Points of the paper's half of a cloud (twice the network's 512 points)
 
 
-def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
+def partial_view(
+    obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None, network: SurfaceNetwork | None = None
+) -> ObjectModel:
     """An object with a mesh in a view: itself, or a bare cloud in its frame with the unseen side completed.
 
     `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the half of the
     points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is one noisy depth image
-    from a random direction.
+    from a random direction. The network completes it, by default the one that ships.
     """
     if view == "whole":
         return obj
@@ -39,7 +42,7 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
     if view == "cloud":
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name, keep_table=True)
     seen, normals, place = visible_side(obj, view, seed, camera)
-    both = complete_cloud(seen, normals, place)
+    both = complete_cloud(seen, normals, place, network=network)
     return cloud_object(
         name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True,
         seen=seen if both.added.any() else None)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.compare.metrics import diversity
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, HandError
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
@@ -73,11 +73,11 @@ class HandCoverage:
 
 
 def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
-    """Coverage of each hand of a data set."""
+    """Coverage of each hand of a data set; one without any grasp, whose file nothing names, is left out."""
     by_hand: dict[str, list[PairGrasps]] = {}
     for pair in of_one_version((None, pair) for pair in pairs):
         by_hand.setdefault(pair.grasps.hand, []).append(pair)
-    return [_of_hand(group) for _, group in sorted(by_hand.items())]
+    return [found for _, group in sorted(by_hand.items()) if (found := _of_hand(group)) is not None]
 
 
 def of_one_version(pairs: Iterable[tuple[Path | None, PairGrasps]]) -> Iterator[PairGrasps]:
@@ -101,9 +101,14 @@ def _told(path: Path | None, pair: PairGrasps) -> tuple[str, str]:
     return place, f"{file}, hash {grasps.hand_sha256[:12] or 'unknown'}"
 
 
-def _of_hand(pairs: list[PairGrasps]) -> HandCoverage:
-    hand = hand_of(next((p.grasps for p in pairs if len(p.grasps)), pairs[0].grasps), None)
+def _of_hand(pairs: list[PairGrasps]) -> HandCoverage | None:
     grasps = GraspBatch.concatenate([p.grasps for p in pairs])
+    try:
+        hand = hand_of(next((p.grasps for p in pairs if len(p.grasps)), grasps), None)
+    except HandError:
+        if len(grasps):
+            raise
+        return None
     parts = tuple(_of_pair(hand, pair) for pair in sorted(pairs, key=lambda p: p.object))
     return HandCoverage(hand, grasps, parts, diversity(grasps.T_object_wrist, grasps.joints))
 
