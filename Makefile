@@ -100,6 +100,9 @@ docs-pictures: setup
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
 	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png
+	$(BIN)/dro-grasp hand check leaphand --picture docs/pictures/hand-check.png
+	$(BIN)/python scripts/draw_rooms.py docs/pictures/rooms.png
+	$(BIN)/python scripts/draw_gallery.py docs/pictures/gallery.png
 	$(BIN)/python -m scripts.draw_studio docs/pictures/studio.png
 	$(BIN)/python -m scripts.draw_scene_page docs/pictures/scene-page.png
 

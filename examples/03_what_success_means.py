@@ -1,4 +1,4 @@
-"""The same grasps under four protocols, beside a control: open hands at the object, never optimised."""
+"""The same grasps under four protocols, beside a control: half-closed hands at the object, never optimised."""
 
 import dro_grasp as dro
 

@@ -15,7 +15,7 @@ SPEED_UP = 10.0  # the fake robot is in a hurry; 1 for a real one
 robot, can = dro.load_robot("xarm7_leaphand"), dro.load_object("can")
 T_world_object = np.eye(4)
 T_world_object[:3, 3] = 0.5, 0.1, -float(can.cloud[:, 2].min())  # on the table, which is at z = 0
-plan = dro.plan(robot, can, T_world_object, config=dro.PlanConfig(num=32))
+plan = dro.plan(robot, can, T_world_object)
 print("\n".join(plan.lines()))
 
 

@@ -244,7 +244,7 @@ def parts(results: Results) -> str:
         ["kernel against the form that writes every pair, one thread", f"{cell['kernel']['speedup']:.0f} times faster, "
          f"{100 * cell['kernel']['memory_ratio']:.0f} % of the memory"],
         ["trials of `carry` a second, all cores", f"{cell['trials']['trials_per_second']:.0f}"],
-        ["synthesised grasps that pass `carry`, an hour of a core", f"{cell['synthesis']['valid_per_cpu_hour']:,.0f}"],
+        ["synthesized grasps that pass `carry`, an hour of a core", f"{cell['synthesis']['valid_per_cpu_hour']:,.0f}"],
     ])
 
 

@@ -79,14 +79,14 @@ def rate(row: Row, protocol: str) -> Found:
     """Success of grasps that were asked for."""
     if protocol not in row.success:
         raise MissingResult(protocol)
-    return Found(100 * row.success[protocol][0], f"{percent(row.success[protocol])} of {row.asked}")
+    return Found(100 * row.success[protocol][0], f"{percent(row.success[protocol])} % of {row.asked}")
 
 
 def counted(good: int, n: int) -> Found:
     """Success of counts."""
     if not n:
         raise MissingResult("")
-    return Found(100 * good / n, f"{percent(success_rate(good, n))} of {n}")
+    return Found(100 * good / n, f"{percent(success_rate(good, n))} % of {n}")
 
 
 def alone(results: Results, where: str, protocol: str) -> Found:
@@ -118,13 +118,13 @@ def optimisers_share(results: Results) -> Found:
     rows = select(results.rows("unseen", ending="returned"), "auto", "returned")
     shares = [100 * row.optimised for row in rows]
     every = 100 * average(rows).optimised
-    return Found(every, f"{every:.0f}, by hand {min(shares):.0f} to {max(shares):.0f}")
+    return Found(every, f"{every:.0f} %, by hand {min(shares):.0f} to {max(shares):.0f} %")
 
 
 def diversity(results: Results, hand: str) -> Found:
     """The paper's measure, over what is returned on the paper's objects."""
     (row,) = (row for row in results.rows("headline", "validate", "returned") if row.hand == hand)
-    return Found(round(row.diversity, 3), f"{row.diversity:.3f} of {row.returned}")
+    return Found(round(row.diversity, 3), f"{row.diversity:.3f}, {row.returned} grasps")
 
 
 def paper_form(results: Results) -> Found:
@@ -161,7 +161,7 @@ def fingers(results: Results, every: bool) -> Found:
     """Fingers that touch under `strict`, or grasps of which all do, of the network's best on the paper's objects."""
     row = average(select(results.rows("headline", "validate", "stages"), "network", "settled, ranked"))
     value = 100 * row.fingers["strict"][int(every)]
-    return Found(value, f"{value:.0f} of {row.returned}")
+    return Found(value, f"{value:.0f} %, {row.returned} grasps")
 
 
 def worst_tenth(results: Results) -> Found:
@@ -169,13 +169,13 @@ def worst_tenth(results: Results) -> Found:
     bins = [b for b in confidence_bins(results) if b.n >= FEWEST_IN_BIN]
     worst = max(bins, key=lambda b: abs(b.predicted - b.held / b.n))
     value = 100 * abs(worst.predicted - worst.held / worst.n)
-    return Found(value, f"{value:.0f} of {worst.n} from {10 * worst.tenth} %")
+    return Found(value, f"{value:.0f} points, {worst.n} grasps of {10 * worst.tenth} to {10 * worst.tenth + 10} %")
 
 
 def payload_error(results: Results) -> Found:
     """Of the payload that is stated, beside trials."""
     error, _, n, _ = payload_errors(results)
-    return Found(error, f"{error:.0f} of {n}")
+    return Found(error, f"{error:.0f} %, {n} grasps")
 
 
 def lost_by_half(results: Results) -> Found:
@@ -185,7 +185,7 @@ def lost_by_half(results: Results) -> Found:
         own = [row.success["carry"][0] for row in with_half(results, where)]
         found.append((100 * (own[0] - own[1]), where, own))
     lost, where, (every, half) = max(found)
-    return Found(lost, f"{lost:.1f}: {100 * half:.1f} of {100 * every:.1f}, {where}")
+    return Found(lost, f"{lost:.1f} points: {100 * half:.1f} instead of {100 * every:.1f} %, {where}")
 
 
 def seconds(results: Results, name: str) -> Found:
@@ -232,7 +232,7 @@ def planning(results: Results, column: str, choose: Callable[[list[float]], floa
     """Time from the image of a scene to a plan, of both robots [s]."""
     rows = [results.cell("planning", robot)["rows"][0] for robot in ROBOTS]
     value = choose([row[column] for row in rows])
-    return Found(value, f"{value:.1f} of {sum(row['asked'] for row in rows)} scenes")
+    return Found(value, f"{value:.1f}, {sum(row['asked'] for row in rows)} scenes")
 
 
 def flat(results: Results) -> Found:

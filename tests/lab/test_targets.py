@@ -46,7 +46,7 @@ def test_a_rate_is_of_the_attempts_in_the_file(tmp_path: Path) -> None:
         {"success": k < 3, "stage": "done"} for k in range(4)]}} for name, command in MEASUREMENTS["lifts"].cells.items()}
     (tmp_path / "lifts.json").write_text(json.dumps({"cells": cells}))
     (line,) = (t.line(Results(tmp_path)) for t in targets.targets() if t.what == "lifted, held and shaken, `ur5e_allegro`")
-    assert line[3:] == ["75.0 [60-86] of 40", "0123456789", "**not reached**"]
+    assert line[3:] == ["75.0 [60-86] % of 40", "0123456789", "**not reached**"]
 
 
 def test_a_row_of_two_states_is_refused(tmp_path: Path) -> None:
@@ -72,13 +72,13 @@ def test_confidence_is_off_by_its_worst_tenth_with_enough_grasps(tmp_path: Path)
     cells = {name: {**CELL, "command": command, "result": {"bins": bins if name.startswith("made") else bins[1:]}}
              for name, command in MEASUREMENTS["confidence"].cells.items()}
     (tmp_path / "confidence.json").write_text(json.dumps({"cells": cells}))
-    assert targets.worst_tenth(Results(tmp_path)).told == "85 of 58 from 10 %", "twice 29, of made hands"
+    assert targets.worst_tenth(Results(tmp_path)).told == "85 points, 58 grasps of 10 to 20 %", "twice 29, of made hands"
     bins[0]["n"] = 14
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "confidence.json").write_text(json.dumps({"cells": cells}))
     found = targets.worst_tenth(Results(tmp_path / "other"))
     assert found.value == pytest.approx(15)
-    assert found.told.endswith(" from 40 %"), "28 are too few to tell"
+    assert found.told.endswith("of 40 to 50 %"), "28 are too few to tell"
 
 
 def test_half_of_the_candidates_loses_the_most_on_one_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,4 +89,4 @@ def test_half_of_the_candidates_loses_the_most_on_one_group(tmp_path: Path, monk
         SimpleNamespace(success={"carry": (rate, 0, 1)}) for rate in held[where]])
     found = targets.lost_by_half(Results(tmp_path))
     assert found.value == pytest.approx(4)
-    assert found.told == "4.0: 76.0 of 80.0, hard"
+    assert found.told == "4.0 points: 76.0 instead of 80.0 %, hard"
