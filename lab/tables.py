@@ -214,9 +214,11 @@ def data_card(results: Results) -> str:
 
 def labels(results: Results) -> str:
     """What the filter keeps of the shipped grasps, and of their diversity."""
-    columns = {"hand": "hand", "grasps": "grasps", "kept": "kept", "kept [%]": "kept [%]", "made anew": "made anew",
-               "diversity": "diversity", "of kept": "diversity of kept", "wrist": "wrist", "of kept wrist": "wrist of kept", "joints": "joints",
-               "of kept joints": "joints of kept", "all six half-axes [%]": "six sides [%]", "of kept half-axes [%]": "six sides of kept [%]"}
+    columns = {
+        "hand": "hand", "grasps": "grasps", "kept": "kept", "kept [%]": "kept [%]", "made anew": "made anew",
+        "diversity": "diversity", "of kept": "diversity of kept", "wrist": "wrist", "of kept wrist": "wrist of kept",
+        "joints": "joints", "of kept joints": "joints of kept", "all six half-axes [%]": "six sides [%]",
+        "of kept half-axes [%]": "six sides of kept [%]"}
     cell = results.cell("labels", "kept")
     return table(tuple(columns.values()), [[row[c] for c in columns] for row in cell["rows"]])
 
