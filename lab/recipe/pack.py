@@ -26,7 +26,7 @@ STATED = ("stage", "command", "commit", "version", "samples", "metrics")
 
 
 def missing(path: Path, changed: bool) -> list[str]:
-    """What a file does not say of how it was made; `changed` lets a commit pass whose code was changed."""
+    """What a file does not say of how it was made; `changed` lets commits with changes and paths of this machine pass."""
     if not path.is_file():
         return ["the file"]
     history: list[dict[str, Any]] = history_of(path) or [{}]
@@ -35,7 +35,7 @@ def missing(path: Path, changed: bool) -> list[str]:
     lacking += [] if about.get("data", {}).get("fingerprint") else ["data.fingerprint"]
     if not changed and any(str(stage.get("commit", "")).endswith("+") for stage in history):
         lacking.append("a commit without changes")
-    if any(" /" in str(stage.get("command", "")) for stage in history):
+    if not changed and any(" /" in str(stage.get("command", "")) for stage in history):
         lacking.append("a command without paths of this machine (run the recipe with a relative --folder)")
     return lacking
 
