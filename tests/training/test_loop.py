@@ -198,6 +198,9 @@ def test_a_motion_is_learned_before_objects_are_seen(bundle: Bundle, tmp_path: P
     train(bundle, network, config, tmp_path / "fresh", report=quiet)
     train(bundle, network, config, tmp_path / "taken", learnt, quiet)
     assert curve(tmp_path / "taken")[0]["motion"] < 0.7 * curve(tmp_path / "fresh")[0]["motion"]
+    with pytest.raises(TrainingError, match="encoder"):  # what was learned of the features of one says nothing of another's
+        pretrain_motion(
+            DistanceNetwork(network), bundle, MotionConfig(schedule, hands_per_step=1), tmp_path / "motion", quiet)
     paper = DistanceNetwork(dataclasses.replace(TINY, frame="object"))
     with pytest.raises(TrainingError, match="frame 'object' has no motion"):
         pretrain_motion(paper, bundle, MotionConfig(schedule), tmp_path / "none", quiet)

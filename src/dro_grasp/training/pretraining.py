@@ -71,7 +71,7 @@ def pretrain_motion(
     motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
     generator = torch.Generator(device)
     source = SampleSource(bundle, model.config, config.augmentation, device)
-    plan = run_plan(config, bundle, model.config)
+    plan = run_plan(config, bundle, model.config, encoder=encoder)
     run = TrainingRun(folder, motion, config.schedule, generator, processes, plan)
     motion.train()
 

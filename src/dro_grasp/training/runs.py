@@ -30,7 +30,6 @@ from dro_grasp.extras import require_extra
 from dro_grasp.files import FOREIGN, UNTYPED, is_unread, make_folder, reason_of, replacing, set_aside
 from dro_grasp.graphs import Repeated
 from dro_grasp.kinds import flat
-from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
@@ -195,7 +194,7 @@ BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds",
 
 
 def run_plan(
-    config: Any, bundle: Bundle, network: NetworkConfig | None = None, **given: DistanceNetwork | None
+    config: Any, bundle: Bundle, network: NetworkConfig | None = None, **given: nn.Module | None
 ) -> dict[str, Any]:
     """What determines the curve of a run, by name: settings of the stage and its network, content of the data, weights.
 
@@ -208,7 +207,7 @@ def run_plan(
         "bundle": bundle.fingerprint}
 
 
-def _digest(network: DistanceNetwork) -> str:
+def _digest(network: nn.Module) -> str:
     """Twelve digits that tell parameters apart; statistics of BatchNorm do not count, as each sitting measures its own."""
     digest = sha256()
     for parameter in network.parameters():
