@@ -127,7 +127,7 @@ def labels(size: Size, folder: str) -> list[Step]:
 
 
 def weights(size: Size, folder: str) -> list[Step]:
-    """The set of four weights, in `FOLDER/weights`, and where they ship."""
+    """The set of four weights, in `FOLDER/weights`, and where they ship; then what the scores are worth of guessed surfaces."""
     grasps, own = f"{folder}/grasps", f"{folder}/weights"
     bundle, validation, pretrained, trained, network, surface, quality, holding = (
         f"{own}/{name}.safetensors" for name in (
@@ -162,6 +162,8 @@ def weights(size: Size, folder: str) -> list[Step]:
              f"--output {holding} --hands {' '.join(size.hands)} {size.holding}", holding, (network, quality),
              "--workers {workers}"),
         Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{' --changed' if size is TINY else ''}"),
+        *([] if size is TINY else [Step("guesses", "python -m lab.studies.seen_score --folder {run}",
+                                        reads=(network, quality, holding, surface))]),
     ]
 
 

@@ -123,6 +123,10 @@ def main() -> None:
     title = (f"offset {offset:.2f}, worth {worth:.2f}, clearance {-clearance:.0f} per metre; {facts['held']} of {len(data)} "
              f"hold; area {facts['area']:.2f}, {facts['area, score alone']:.2f} of the score alone")
     emit(title, rows, ["left-out confidence", "n", "predicted [%]", "held [%]"], facts, options.json)
+    if not options.json:
+        now = SettleConfig()
+        print(f"settling takes offset {now.guess_offset}, worth {now.guess_worth}, clearance {now.clearance_worth:g}; new "
+              "scores or a new completion may need others, in `SettleConfig`")
 
 
 if __name__ == "__main__":
