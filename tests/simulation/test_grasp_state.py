@@ -24,8 +24,8 @@ from dro_grasp.simulation.grasp_state import (
     grasp_state,
     press,
     pressed,
+    squeezes_of,
     unanswered,
-    weight_torques,
 )
 from dro_grasp.simulation.protocols import CARRY
 from dro_grasp.simulation.rollout import Pulls, rollouts
@@ -148,7 +148,7 @@ def test_torques_that_hold_the_weight_are_those_of_the_least_forces(hand: Hand) 
     points = (hand.tree.forward(joints)[0, tips, :3, 3] + torch.tensor([0.0, 0.0, 0.03])).double().numpy()
     contacts = held_by(tips, points, points.mean(0) + np.array([0.004, 0.002, -0.003]))
     config = WeightConfig(margin=1.5, iterations=2000)
-    found = weight_torques(hand, [contacts], joints, torch.tensor([0.2]), config)[0]
+    found = 0.2 * squeezes_of(hand, [contacts], joints, joints, config).torques[0]
     forces = least_forces(contacts, 1.5 * 9.81 * 0.2, config.friction, config.edges)
     jacobian = hand.tree.point_jacobian(
         hand.tree.forward(joints)[0], torch.from_numpy(points).float(), torch.from_numpy(tips)).double().numpy()
@@ -160,10 +160,10 @@ def test_torques_that_hold_the_weight_are_those_of_the_least_forces(hand: Hand) 
 def test_nothing_presses_for_a_weight_without_margin_or_contacts(hand: Hand) -> None:
     joints = torch.zeros(1, hand.tree.n_dof)
     nothing = held_by(np.zeros(0, int), np.zeros((0, 3)), np.zeros(3))
-    assert not weight_torques(hand, [nothing], joints, MASS).any()
+    assert not squeezes_of(hand, [nothing], joints, joints, WeightConfig()).torques.any()
     tips = np.array(hand.tips)
     some = held_by(tips, np.eye(4)[:, :3] * 0.03 + 0.05, np.zeros(3))
-    assert not weight_torques(hand, [some], joints, MASS, WeightConfig(margin=0.0)).any()
+    assert not squeezes_of(hand, [some], joints, joints, WeightConfig(margin=0.0)).torques.any()
 
 
 def test_payloads_of_some_rows_are_those_of_all(hand: Hand, obj: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -279,16 +279,6 @@ def squeezes_of(
     return Squeezes(hand, joints, base, torques, normal, touch, config.stiffness, config.max_force)
 
 
-def weight_torques(
-    hand: Hand, contacts: list[ContactForces], joints: Float[Tensor, "n n_dof"], mass: Float[Tensor, " n"],
-    config: WeightConfig | None = None,
-) -> Float[Tensor, "n n_dof"]:
-    """Torques by which joints press so that contacts hold the weight along each axis and against it [Nm or N]."""
-    config = config or WeightConfig()
-    touch = pressing(hand, contacts, joints, config.contacts)
-    return torch.einsum("nkc,nkcd->nd", weight_forces(touch, mass, config), touch.jacobian)
-
-
 def weight_forces(touch: Pressing, mass: Float[Tensor, " n"], config: WeightConfig) -> Float[Tensor, "n k 3"]:
     """Forces with which contacts press for the weight along each axis and against it [N].
 

@@ -457,11 +457,3 @@ def _cut_off(sight: Sight, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
         what = CLOUD_EDGE
     return (f"{CUT_OFF.format(what)}: grasps know nothing of the rest. Turn the camera so that all of it "
             "is seen",) if cut else ()
-
-
-def shown(segments: Segments, chosen: Chosen | None) -> Bool[np.ndarray, " n"]:
-    """Which points are a table's, a board's or a wall's, and not the object's."""
-    mine = segments.labels == STRUCTURE
-    if chosen is not None:
-        mine[chosen.own] = False
-    return mine
