@@ -23,8 +23,8 @@ from lab.reading import table
 
 PAGE = ROOT / "docs" / "licences.md"
 OWN = "dro-grasp"
-LEFT_OUT = ("dev", "serve")
-"""Extras without packages that users get: tools of development, and another name."""
+LEFT_OUT = ("dev",)
+"""Extras without packages that users get: tools of development."""
 BY_FILE = {"embreex": "BSD-2-Clause", "vhacdx": "MIT"}
 """What licence files say of packages that name no licence."""
 ELSEWHERE = {"robot-descriptions": "Apache-2.0", "tensorboard": "Apache-2.0"}

@@ -19,7 +19,7 @@ import torch
 
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
-from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, checked, plain, renamed
+from dro_grasp.kinds import Checked, checked, plain
 from dro_grasp.network.presets import NetworkConfig
 
 OF_A_GPU = ("dro_grasp.network.fused",) if find_spec("triton") is None else ()  # PyTorch without CUDA comes without Triton
@@ -129,41 +129,3 @@ def test_functions_take_them_too() -> None:
     with pytest.raises(TypeError):
         draw("a", wrong=1)
     assert list(inspect.signature(draw).parameters) == ["where", "count", "scale"]
-
-
-FORMER = {"hold": ((0.0, 0.0, 0.0, 0.1),), "spare": ((0.0, 0.0, 0.5, 0.1),), "opening": 0.01, "cone": 0.5}
-
-
-def test_fields_of_before_are_taken_and_told() -> None:
-    """Constraints by their former names are the same, in construction, in `replace`, and when they are read."""
-    up = (0.0, 0.0, -1.0)
-    now = dro.Constraints(up, contact_region=FORMER["hold"], keep_out=FORMER["spare"], pregrasp_clearance=0.01, max_tilt=0.5)
-    with pytest.warns(FutureWarning) as told:
-        before = dro.Constraints(up, **FORMER)
-    assert before == now
-    assert [str(w.message) for w in told] == [f"{name} is called {FORMER_CONSTRAINTS[name]} now" for name in FORMER]
-    with pytest.warns(FutureWarning, match="cone is called max_tilt now"):
-        assert dataclasses.replace(now, cone=0.2) == dataclasses.replace(now, max_tilt=0.2)
-    for name, value in FORMER.items():
-        with pytest.warns(FutureWarning, match=f"{name} is called"):
-            assert getattr(now, name) == value
-    with pytest.warns(FutureWarning, match="doubt is called warning now"):
-        assert now.doubt(dro.load_object("can")) is None  # type: ignore[attr-defined]
-    with pytest.raises(TypeError, match="held"):
-        dro.Constraints(held=())  # type: ignore[call-arg]
-
-
-def test_arguments_of_before_are_taken_and_told() -> None:
-    """A function takes them by both names, and refuses what was never one."""
-    @renamed(hold="contact_region")
-    def asked(num: int, contact_region: int = 0) -> tuple[int, int]:
-        return num, contact_region
-
-    assert asked(1, contact_region=2) == (1, 2)
-    with pytest.warns(FutureWarning, match="hold is called contact_region now"):
-        assert asked(1, hold=2) == (1, 2)  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match="held"):
-        asked(1, held=2)  # type: ignore[call-arg]
-    taken = inspect.signature(dro.GraspPredictor.predict).parameters
-    assert set(FORMER_CONSTRAINTS.values()) <= set(taken)
-    assert not set(FORMER_CONSTRAINTS) & set(taken)

@@ -1,4 +1,4 @@
-"""What users give: numbers and truth values, made Python's or refused by name, and names of before, still taken."""
+"""What users give: numbers and truth values, made Python's or refused by name."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import dataclasses
 import functools
 import inspect
 import operator
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -137,65 +136,3 @@ def flat(record: Any, prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{field.name}"
         values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
     return values
-
-
-FORMER_CONSTRAINTS = {
-    "hold": "contact_region", "spare": "keep_out", "avoid": "obstacles", "opening": "pregrasp_clearance", "cone": "max_tilt"}
-"""What the constraints of grasps were called in 0.1, and are called now: in Python, on the command line, and in JSON."""
-FORMER_SOURCES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": "auto"}  # The same of sources of grasps
-Named = TypeVar("Named", bound=Callable[..., Any])
-
-
-def renamed(**former: str) -> Callable[[Named], Named]:
-    """Let a function or class answer to names of before as well, with a FutureWarning: for one release after they changed.
-
-    Args:
-        former: The present name by each former one: of a function's argument, or of a class's field, property or method.
-    """
-    def decorate(owner: Named) -> Named:
-        changed: Any = owner
-        if isinstance(changed, type):
-            _answer_to_former(changed, former)
-            return owner
-        return _taking_former(changed, former)  # type: ignore[return-value]
-
-    return decorate
-
-
-def present(name: str, former: Mapping[str, str], what: str = "") -> str:
-    """The name of today for a name that may be of before, which is told by a FutureWarning."""
-    if name not in former:
-        return name
-    warnings.warn(f"{what}{name} is called {former[name]} now", FutureWarning, stacklevel=3)
-    return former[name]
-
-
-def _taking_former(call: Callable[..., Any], former: Mapping[str, str]) -> Callable[..., Any]:
-    """A function that takes its arguments by former names too.
-
-    Both names are given where `dataclasses.replace` fills in the fields that it was not asked to change: the former one counts.
-    """
-    @functools.wraps(call)
-    def taking(*args: Any, **kwargs: Any) -> Any:
-        for old in [name for name in kwargs if name in former]:
-            kwargs[present(old, former)] = kwargs.pop(old)
-        return call(*args, **kwargs)
-
-    return taking
-
-
-def _answer_to_former(owner: Any, former: Mapping[str, str]) -> None:
-    """Let a class be made and read by former names too."""
-    signature = inspect.signature(owner.__init__)
-    given = {old: new for old, new in former.items() if new in signature.parameters}
-    if given:
-        owner.__init__ = _taking_former(owner.__init__, given)
-        # What checks calls by their signature, as jaxtyping does, must not refuse the former names.
-        more = inspect.Parameter("former", inspect.Parameter.VAR_KEYWORD, annotation=Any)
-        owner.__init__.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])
-    for old, new in former.items():
-        setattr(owner, old, _former_attribute(old, new))
-
-
-def _former_attribute(old: str, new: str) -> property:
-    return property(lambda owner: getattr(owner, present(old, {old: new})), doc=f"Former name of `{new}`.")

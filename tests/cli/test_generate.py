@@ -85,13 +85,6 @@ def test_a_source_that_does_not_exist_is_told_before_the_work(capsys) -> None:
         assert "no_hand" not in said
 
 
-def test_the_former_option_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["generate", "--hand", "gripper3", "--object", "no_object", "--method", "optimise"]) == 2
-    told, error = capsys.readouterr().err.splitlines()
-    assert told == "warning: --method is called --source now, optimise is called optimiser now"
-    assert "no_object" in error
-
-
 def test_what_grasps_carry_is_told(
     generate, weights: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -293,17 +293,6 @@ def test_poses_and_joints_that_are_none_are_refused(change, told):
         GraspBatch.create(toy_hand(), ball(), *change(given.T_object_wrist, given.joints))
 
 
-def test_methods_of_before_are_taken_and_told() -> None:
-    """`bare` and `moved_to` are `poses_only` and `with_poses`, for one release."""
-    batch = evaluated(3, score=torch.rand(3))
-    with pytest.warns(FutureWarning, match="bare is called poses_only now"):
-        before = batch.bare()
-    assert not before.evaluated.any()
-    assert torch.equal(before.joints, batch.joints)
-    with pytest.warns(FutureWarning, match="moved_to is called with_poses now"):
-        assert torch.equal(batch.moved_to(batch.T_object_wrist, batch.joints + 1).joints, batch.joints + 1)
-
-
 def test_a_further_column_of_three_axes_is_refused() -> None:
     with pytest.raises(ValueError, match=r"more than two axes: {'mine': \(2, 2, 3\)}"):
         make(2).replace(extra={"mine": torch.zeros(2, 2, 3)})
@@ -314,6 +303,13 @@ def test_a_further_column_of_three_axes_is_refused() -> None:
 def test_indices_of_any_size_choose(kind: type) -> None:
     batch = make(2)
     assert torch.equal(batch[np.array([1, 0], kind)].joints, batch.joints.flip(0))
+
+
+def test_poses_alone_have_no_trial() -> None:
+    batch = evaluated(3, score=torch.rand(3))
+    before = batch.poses_only()
+    assert not before.evaluated.any()
+    assert torch.equal(before.joints, batch.joints)
 
 
 def test_other_poses_know_no_hold() -> None:

@@ -545,8 +545,6 @@ def test_the_optimiser_alone_asks_no_network(predictor: GraspPredictor, ball: Ob
 def test_what_is_no_source_is_refused_before_any_work() -> None:
     with pytest.raises(OptionError, match="there is no source 'magic'; choose auto, network, optimiser, dfc, start"):
         GraspRequest(source="magic")
-    with pytest.warns(FutureWarning, match="source optimise is called optimiser now"):
-        assert GraspRequest(source="optimise").source == "optimiser"
 
 
 def test_what_threads_compute_beside_each_other_rounds_in_one_way(

@@ -98,12 +98,6 @@ def test_weights_of_a_method_stand_behind_its_name(weights: str) -> None:
         make_method(f"dfc@{weights}")
 
 
-@pytest.mark.parametrize(("former", "name"), [("dro", "auto"), ("synthesise", "optimiser"), ("optimise", "optimiser")])
-def test_former_names_are_taken_with_a_warning(weights: str, former: str, name: str) -> None:
-    with pytest.warns(FutureWarning, match=f"source {former} is called {name} now"):
-        assert make_method(former, MethodOptions(weights)).name == name
-
-
 def test_a_descent_keeps_whatever_comes_out() -> None:
     """As many grasps as descents: the n of a larger run are those of a smaller one beside others, not the best of them."""
     problem = GraspProblem(toy_hand(), load_object("sphere"))

@@ -45,20 +45,11 @@ def test_options_that_contradict_initial_weights_are_refused(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for options, told in (
-        (["--size", "slim"], "n_hand 160 instead of 48"), (["--preset", "paper"], "frame object instead of palm"),
-        (["--latent", "6"], "--latent is no longer a choice: it is 4"),
-        (["--prior", "standard"], "--prior is no longer a choice"),
-        (["--drawn", "1"], "--drawn is no longer a choice: it is 0"), (["--free-bits", "0.1"], "--free-bits is no longer"),
-        (["--latent-form", "kernel"], "--latent-form is no longer a choice: it is motion in frame 'palm'"),
-        (["--placement-hand", "features"], "--placement-hand is no longer a choice"),
-        (["--method", "manifm"], "`python -m lab.methods.train`"),
+        (["--preset", "slim"], "n_hand 160 instead of 48"), (["--preset", "paper"], "frame object instead of palm"),
     ):
         assert main([*command, *options]) == 2
         assert told in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    same = ["--latent", "4", "--prior", "flow", "--latent-form", "motion", "--method", "dro"]
-    assert main([*command, *same, "--drawn", "0.0", "--free-bits", "0"]) == 0, "they say the same"
-    assert capsys.readouterr().err.count("warning: --") == 6
 
 
 def test_weights_of_another_configuration_are_refused(bundle: Bundle, tmp_path: Path) -> None:

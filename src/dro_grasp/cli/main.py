@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -21,13 +20,11 @@ from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
 from dro_grasp.cli.listing import Hands, Objects, Weights
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.output import say_aside
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
 from dro_grasp.cli.switches import in_switches, use_options_of
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
-from dro_grasp.kinds import FORMER_CONSTRAINTS, FORMER_SOURCES
 
 DONE = 0  # Exit code of a command that succeeded
 FAILED = 1  # Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`
@@ -62,51 +59,6 @@ Command = (
 )
 """Every command of the tool."""
 
-GONE = None  # What an option is called that is no longer a choice; `former` of its command has it
-CONSTRAINTS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in FORMER_CONSTRAINTS.items()}
-"""What options of constraints were called, and are."""
-TRAINING: dict[str, str | None] = {"--size": "--preset"} | dict.fromkeys((
-    "--method", "--latent", "--latent-form", "--prior", "--placement-hand", "--divergence-warmup", "--free-bits",
-    "--drawn"), GONE)
-"""The same of training."""
-FORMER_OPTIONS: dict[str, Mapping[str, str | None]] = {
-    "generate": CONSTRAINTS | {"--method": "--source"},
-    # --obstacles are things of an object's size there
-    "plan": CONSTRAINTS | {"--avoid": "--surroundings"},
-    "tabletop": {option: CONSTRAINTS[option] for option in ("--cone", "--opening")},
-    "onboard": {"--method": "--source"}, "benchmark": {"--looks": "--views"}, "train": TRAINING, "pretrain": TRAINING,
-}
-"""What options of before are called now, by command. They are still read: scripts of before work, or are told why not."""
-
-
-def present_options(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """The arguments as they are called now, without options that are no longer a choice, and these with their values.
-
-    What has changed is told in one line.
-    """
-    former = FORMER_OPTIONS.get("".join(arguments[:1]), {})
-    rest: list[str] = []
-    gone: dict[str, str] = {}
-    told: dict[str, str] = {}
-    words = iter(arguments)
-    for word in words:
-        option, equals, value = word.partition("=")
-        now = former.get(option, option)
-        if now is None:
-            gone[option] = value if equals else next(words, "")
-            continue
-        told |= {option: now} if now != option else {}
-        if now == "--source":
-            value = value if equals else next(words, "")
-            source = FORMER_SOURCES.get(value, value)
-            told |= {value: source} if source != value else {}
-            rest += [now, source] if equals or value else [now]
-        else:
-            rest.append(now + equals + value)
-    if told:
-        say_aside("warning: " + ", ".join(f"{old} is called {new} now" for old, new in told.items()))
-    return rest, gone
-
 
 def parse(arguments: Sequence[str]) -> Any:
     """Parse the arguments into a command; of a group such as `dataset`, the one in it.
@@ -114,18 +66,16 @@ def parse(arguments: Sequence[str]) -> Any:
     Raises:
         SystemExit: With code 2 after a message about invalid arguments, with code 0 after `--help`.
     """
-    rest, former = present_options(arguments)
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="dro-grasp",
         description="Any robot hand description in, simulation-checked dexterous grasps out. "
         "--version prints the version. At any place, --verbose shows tracebacks, and --threads N computes in N threads "
         "(default: one for each core).",
-        args=rest,
+        args=list(arguments),
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
-    command = getattr(command, "command", command)
-    return dataclasses.replace(command, former=former) if former else command
+    return getattr(command, "command", command)
 
 
 def without_threads(arguments: Sequence[str]) -> list[str]:

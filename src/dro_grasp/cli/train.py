@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import print_result, print_table, say_aside
+from dro_grasp.cli.output import print_result, print_table
 from dro_grasp.errors import OptionError
 from dro_grasp.files import check_output
 
@@ -45,23 +45,13 @@ class Stage:
     """Where to compute: cpu, cuda, or cuda:1."""
     seed: int = 0  # Seed of everything.
     json: Flag = False  # Print one JSON object at the end.
-    former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)  # Options of `FORMER_OPTIONS` that were given.
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
         """The configuration of the preset, else of the initial weights, else of `multi`."""
-        from dro_grasp.network.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
+        from dro_grasp.network.presets import NetworkConfig
 
         given = None if initial is None or self.preset is not None else initial.config
-        network = given or NetworkConfig.preset(self.preset or "multi")
-        kept = {"method": "dro", "latent": network.latent, "divergence_warmup": 0, "free_bits": 0, "drawn": 0}
-        for option, asked in self.former.items():
-            fixed = str((kept | FORMER[network.frame])[option.removeprefix("--").replace("-", "_")])
-            if asked.removesuffix(".0") != fixed:
-                raise OptionError(f"{option} is no longer a choice: it is {fixed} in frame '{network.frame}', and {asked} was "
-                                  f"last possible in {LAST_WITH_OTHERS}; leave it out, or choose another --preset. Other "
-                                  "methods are trained by `python -m lab.methods.train` in a clone of the repository")
-            say_aside(f"warning: {option} is no longer a choice; {fixed} is what there is, so leave the option out")
-        return network
+        return given or NetworkConfig.preset(self.preset or "multi")
 
     def schedule(self, **more: Any) -> ScheduleConfig:
         """The schedule, which can be carried out here."""

@@ -10,7 +10,7 @@ import torch
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import FORMER_SOURCES, Checked, present
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -56,7 +56,6 @@ class Method:
         Raises:
             OptionError: There is no such source.
         """
-        source = present(source, FORMER_SOURCES, "source ") if isinstance(source, str) else source
         self.predictor, self.source, self.candidates = predictor, predictor.source(source), candidates
         self.asks = AUTO if source == AUTO else self.source
         self.name = name or (AUTO if source == AUTO else self.source.name)
@@ -102,7 +101,6 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     """
     options = options or MethodOptions()
     plain, at, weights = name.partition("@")
-    plain = present(plain, FORMER_SOURCES, "source ")
     own = bool(at) and plain in (AUTO, "network")
     config = PredictorConfig()
     if options.temperature is not None:

@@ -25,14 +25,12 @@ from dro_grasp.files import check_output, given_path, reading, replacing
 from dro_grasp.grasps import columns, grasp_file
 from dro_grasp.grasps.columns import NOT_EVALUATED, REASON
 from dro_grasp.grasps.grasp_file import EXPECTED, encode, quaternions_wxyz, read_table, table_bytes
-from dro_grasp.kinds import renamed
 
 if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
 
-@renamed(bare="poses_only", moved_to="with_poses")
 @dataclass(frozen=True, eq=False)
 class GraspBatch:
     """n grasps of one hand, of one or several objects.

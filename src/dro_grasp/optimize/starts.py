@@ -14,7 +14,7 @@ from dro_grasp.devices import Rows
 from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField, DistanceFields
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked, renamed
+from dro_grasp.kinds import Checked
 from dro_grasp.optimize.grasp_energy import EnergyConfig, Surroundings
 
 Direction = tuple[float, float, float]  # A vector in the object's frame, of any length but zero
@@ -100,7 +100,6 @@ def wrist_rotations(
 CHOICES = 8  # Wrist rotations among which each hand takes the one with most room (ours)
 
 
-@renamed(hold="contact_region", cone="max_tilt")
 @dataclass(frozen=True)
 class StartConfig(Checked):
     """Distribution of the starts. Source of the scheme: DexGraspNet; the numbers are ours."""

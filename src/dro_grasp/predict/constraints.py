@@ -15,7 +15,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.files import MAX_QUOTED_CHARS
 from dro_grasp.geometry.distance_field import Ball, Balls
-from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, plain, renamed
+from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.grasp_energy import Surroundings, Workspace
@@ -35,7 +35,6 @@ DirectionLike = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]
 BallRows = Sequence[Sequence[float]] | Real[np.ndarray, "n 4"] | Real[Tensor, "n 4"]  # What may be given for balls
 
 
-@renamed(**FORMER_CONSTRAINTS, doubt="warning", room="workspace")
 @dataclass(frozen=True)
 class Constraints(Checked):
     """What grasps have to respect; nothing by default. All in the object's frame.

@@ -20,7 +20,6 @@ from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import FORMER_CONSTRAINTS, renamed
 from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
@@ -100,7 +99,6 @@ class GraspPredictor:
         """Name of the weights."""
         return self.network.name
 
-    @renamed(**FORMER_CONSTRAINTS)
     def predict(
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
         direction: DirectionLike | None = None, max_tilt: float | None = None, table: float | None = None,

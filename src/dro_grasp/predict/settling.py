@@ -21,7 +21,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked, renamed
+from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
@@ -51,7 +51,6 @@ SLIGHT = 5.0  # Force that counts as nothing [N] (ours)
 GRAVITY = 9.81  # [m/s^2]
 
 
-@renamed(room_worth="clearance_worth")
 @dataclass(frozen=True)
 class SettleConfig(Checked):
     """Which grasps settle, what counts as holding still while the hand closes, and what that means for the score (ours)."""

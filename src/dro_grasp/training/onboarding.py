@@ -23,7 +23,7 @@ from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.files import check_folder, command, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.kinds import FORMER_SOURCES, Checked, flat
+from dro_grasp.kinds import Checked, flat
 from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.pictures.sheets import draw_grasps
@@ -218,7 +218,7 @@ class _Onboarding:
         lasting = {name: value for name, value in settings.items()
                    if name.split(".", 1)[1].removeprefix("schedule.") not in FREE | BOOKKEEPING}
         asked = {"weights": config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out, "num": config.num,
-                 "most_grasps": config.most_grasps, "source": FORMER_SOURCES.get(config.source, config.source),
+                 "most_grasps": config.most_grasps, "source": config.source,
                  "seed": config.seed, **lasting}
         return json.loads(json.dumps(asked, default=str))
 

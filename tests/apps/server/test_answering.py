@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -173,19 +172,6 @@ CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
 def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
     with pytest.raises(dro.DroGraspError, match=told):
         answerer.answer(GraspCall(**{"hand": "gripper3", "object": "can", **QUICK, **asked}))
-
-
-def test_fields_of_before_are_taken_and_told(answerer: Answerer) -> None:
-    """A robot that asks in the words of before is answered, and told the words of today; both at once are refused."""
-    asked = {"hand": "gripper3", "object": "can", "hold": [[0, 0, 0, 0.3]], "opening": 0.01, "method": "optimise"}
-    call = GraspCall.model_validate_json(json.dumps(asked))
-    assert (call.contact_region, call.pregrasp_clearance, call.source) == (((0, 0, 0, 0.3),), 0.01, "optimiser")
-    assert call.told.split(", ")[0] == "hold is called contact_region now"
-    assert GraspCall(hand="gripper3", object="can").told is None
-    assert pickle.loads(pickle.dumps(call)).told == call.told, "it travels to the process that answers"
-    with pytest.raises(ValueError, match="hold is called contact_region now, and both are given"):
-        GraspCall(**asked, contact_region=[])
-    assert "avoid is called obstacles now" in ask(answerer, "can", num=1, avoid={"points": [[9.0, 0, 0]]}).notes[-1]
 
 
 def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answerer, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ class Answerer:
             id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
             wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(hand, grasps, made),
             candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
-            notes=[*obj.notes, *filter(None, [call.told, warning])], shortage=made.shortage,
+            notes=[*obj.notes, *filter(None, [warning])], shortage=made.shortage,
             seconds={name: round(value, 4) for name, value in seconds.items()})
 
     def _generated(

@@ -16,7 +16,7 @@ from urllib.request import Request, urlopen
 
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import given_path, reason_of
-from dro_grasp.kinds import FORMER_CONSTRAINTS, checked, present
+from dro_grasp.kinds import checked
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -62,7 +62,6 @@ class GraspClient:
             ServerError: The server refuses, fails or is not there.
         """
         of_object = {name: options.pop(name) for name in ("scale", "keep_table") if name in options}
-        options = {present(name, FORMER_CONSTRAINTS): value for name, value in options.items()}
         if options.get("obstacles") is not None:
             options["obstacles"] = sent_object(options["obstacles"])
         if not isinstance(choose := options.get("choose") or {}, Mapping):

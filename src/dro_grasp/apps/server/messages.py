@@ -7,15 +7,13 @@ import base64
 import inspect
 import textwrap
 import uuid
-from collections.abc import Callable
 from dataclasses import MISSING, fields
 from itertools import pairwise
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, create_model, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, create_model, field_validator, model_validator
 
-from dro_grasp.kinds import FORMER_CONSTRAINTS, FORMER_SOURCES
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 
@@ -32,7 +30,6 @@ def no_truth(given: Any) -> Any:
 Number = Annotated[float, BeforeValidator(no_truth)]
 Point = tuple[Number, Number, Number]
 Row = tuple[Number, Number, Number, Number]
-FORMER_FIELDS = FORMER_CONSTRAINTS | {"method": "source"}  # Fields of a request, as they were called, and are
 Settings = TypeVar("Settings")
 
 
@@ -127,29 +124,6 @@ class _Call(Message):
     """Evaluate each grasp in simulation under this protocol, which needs a mesh; by default grasps get no trial."""
     id: str = Field(default_factory=lambda: uuid.uuid4().hex, max_length=64, pattern=r"^[\w-]+$")
     """Name of the request, by which it can be cancelled."""
-    _former: tuple[str, ...] = PrivateAttr(())
-
-    @property
-    def told(self) -> str | None:
-        """Which names of before were given, in words; None for none."""
-        return ", ".join(f"{name} is called {FORMER_FIELDS[name]} now" for name in self._former) or None
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _present(cls, given: Any, handler: Callable[[Any], Any]) -> Any:
-        """Take names of before too: robots in the field are updated later than their server."""
-        former = tuple(name for name in given if name in FORMER_FIELDS) if isinstance(given, dict) else ()
-        for name in former:
-            if FORMER_FIELDS[name] in given:
-                raise ValueError(f"{name} is called {FORMER_FIELDS[name]} now, and both are given; leave out {name}")
-        call = handler({FORMER_FIELDS.get(name, name): value for name, value in given.items()} if former else given)
-        call._former = former
-        return call
-
-    @field_validator("source", mode="before", check_fields=False)
-    @classmethod
-    def _source_of_today(cls, given: Any) -> Any:
-        return FORMER_SOURCES.get(given, given) if isinstance(given, str) else given
 
 
 WIRE_TYPES: dict[str, Any] = {"obstacles": SentObject | None, "source": Literal["auto", "network", "optimiser"]}

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dro_grasp.errors import DroGraspError, OptionError
-from dro_grasp.kinds import FORMER_SOURCES, present
 from dro_grasp.predict.sources.controls import MeanGrasp, MeanGraspSource, StartSource
 from dro_grasp.predict.sources.optimiser import DescentSource
 from dro_grasp.predict.sources.own import FileSource, OwnSource
@@ -32,7 +31,7 @@ def register_source(name: str, factory: Callable[[], Any]) -> None:
     Raises:
         OptionError: The name is taken, or could be mistaken for a file or a class.
     """
-    if name in source_names() or name in (AUTO, *FORMER_SOURCES, *WITH_DATA):
+    if name in source_names() or name in (AUTO, *WITH_DATA):
         raise OptionError(f"there is a source '{name}' already; choose another name")
     if not name or set(name) & set(":@/\\") or name.endswith(".parquet"):
         raise OptionError(f"'{name}' is no name of a source; give one without : @ / and without .parquet")
@@ -51,7 +50,6 @@ def source_or_name(name: str) -> str | Source:
         OptionError: See `make_source`.
         GraspFileError: Likewise.
     """
-    name = present(name, FORMER_SOURCES, "source ")
     return name if name in (AUTO, *OF_THE_PREDICTOR) else make_source(name)
 
 
@@ -66,7 +64,6 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
         OptionError: There is no such source, or it lacks what it needs.
         GraspFileError: The grasp file cannot be read.
     """
-    name = present(name, FORMER_SOURCES, "source ")
     if name in (AUTO, *OF_THE_PREDICTOR):
         raise OptionError(f"source '{name}' needs a network and a configuration; GraspPredictor().source('{name}') makes it")
     if name in SOURCES:
