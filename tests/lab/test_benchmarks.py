@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import math
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,32 +44,9 @@ from lab.benchmarks import (
 )
 from lab.benchmarks.report import ROOT, note
 from lab.measurements import STORED
-from lab.studies import directions, matching_rank, paper_form
+from lab.studies import paper_form
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
-from tests.helpers.toy_hand import toy_hand
-
-
-def test_counterparts_lie_on_the_same_part_of_the_hand() -> None:
-    counterparts = matching_rank.counterparts
-    hand, other = loaded_hand("allegro"), loaded_hand("leaphand")
-    assert torch.equal(counterparts(hand, hand), torch.arange(hand.n_points))
-    index = counterparts(hand, other)
-    on_palm, lands_on_palm = hand.link_index == hand.palm, other.link_index[index] == other.palm
-    assert float(lands_on_palm[on_palm].float().mean()) > 0.6
-    tips = torch.isin(hand.link_index, torch.tensor(hand.tips))
-    assert float(lands_on_palm[tips].float().mean()) < 0.1
-
-
-def test_palm_angles_are_scipys() -> None:
-    palm_angles, hand = directions.palm_angles, toy_hand()
-    grasps = made_up_grasps(hand, count=15)
-    requested = np.array([1.0, 2.0, -2.0])
-    turned = Rotation.from_matrix(grasps.T_object_wrist[:, :3, :3].numpy()).apply(hand.palm_direction_wrist.numpy())
-    np.testing.assert_allclose(palm_angles(hand, grasps, (1.0, 2.0, -2.0)), np.arccos(turned @ requested / 3), atol=1e-5)
-    twice = dataclasses.replace(grasps[[0]], T_object_wrist=torch.eye(4)[None])
-    opposite = tuple((-hand.palm_direction_wrist).tolist())
-    assert float(palm_angles(hand, twice, opposite)) == pytest.approx(math.pi, abs=1e-5)
 
 
 def test_the_gain_by_pretraining_is_scipys_paired_interval() -> None:

@@ -37,7 +37,7 @@ CACHED = 12  # Graphs that are kept, with the memory of their worlds (ours)
 class Room:
     """Memory for what touches in a world: as much as the closings of ten in fifteen hands need; others get twice as much.
 
-    Counts are of lab/studies/contact_room.py.
+    Counts are of fifteen hands that close on sixty stored grasps each (lab/notebook).
     """
 
     contacts: int = 48  # pairs of shapes that are near each other, on average: 9 to 27 where a hand closes on many objects
