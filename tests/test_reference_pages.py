@@ -11,6 +11,7 @@ import pytest
 
 from dro_grasp import errors
 from dro_grasp.arm.tabletop.attempts import Attempt
+from dro_grasp.geometry.contact_forces import LEVER
 from dro_grasp.geometry.multilateration import MultilaterationConfig
 from dro_grasp.grasps.columns import (
     CAMERA,
@@ -40,7 +41,7 @@ from dro_grasp.predict.score.features import GRASP_FEATURES, LINK_FEATURES, NEAR
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.predict.sources.choice import ChoiceConfig, ChoicePenalties
 from dro_grasp.simulation.contacts import NAMES
-from dro_grasp.simulation.grasp_state import CHANGE, LEVER, PUSH, UNIT
+from dro_grasp.simulation.grasp_state import CHANGE, PUSH, UNIT
 from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import cached_scene

@@ -34,6 +34,7 @@ from jaxtyping import Bool, Float
 
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.errors import NoGraspError
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.grasps.hold import STATES, HoldCheck, HoldConfig, HoldExpectation, HoldState, check_hold
 from dro_grasp.hands.hand import Hand
@@ -43,7 +44,7 @@ from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.conditions import draw
 from dro_grasp.simulation.holding import closing_of, expect_hold, rest
-from dro_grasp.simulation.payload import GRAVITY, servo_torques
+from dro_grasp.simulation.payload import servo_torques
 from dro_grasp.simulation.protocols import ROBUST
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import scene_of

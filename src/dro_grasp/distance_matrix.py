@@ -7,29 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.devices import Rows, on_device
-from dro_grasp.geometry.multilateration import MultilaterationConfig, SideConfig, choose_sides, distance_misfit, multilaterate
+from dro_grasp.geometry.multilateration import choose_sides, distance_misfit, multilaterate
 from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, register
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, read_joints, solve_joints
-from dro_grasp.kinds import Checked
-
-
-@dataclass(frozen=True)
-class DecodeConfig(Checked):
-    """Settings of the decoding."""
-
-    multilateration: MultilaterationConfig = field(default_factory=MultilaterationConfig)
-    """Closed form and its refinement."""
-    sides: SideConfig = field(default_factory=SideConfig)
-    """Choice between mirrored candidates on flat clouds."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +72,7 @@ def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b
     return point_distances(hand_points, object_points)
 
 
-def decode(
-    hand: Hand, distances: Float[Tensor, "*b n m"], object_points: Float[Tensor, "*b m 3"], config: DecodeConfig | None = None
-) -> LinkPoses:
+def decode(hand: Hand, distances: Float[Tensor, "*b n m"], object_points: Float[Tensor, "*b m 3"]) -> LinkPoses:
     """Multilaterate each row of D(R,O), predicted or exact [m], and register each link of the hand; differentiable.
 
     A flat object cloud leaves two mirrored candidates per point. Each link takes the candidates that it fits without a
@@ -95,7 +82,7 @@ def decode(
     distances, object_points = distances.reshape(-1, n, m), object_points.reshape(-1, m, 3)
     where = (distances.device, distances.dtype)
     segments = hand.kept(("segments", *where), lambda: segments_of([hand], *where))
-    poses, residual, points = decode_segments(segments, distances, object_points, config)
+    poses, residual, points = decode_segments(segments, distances, object_points)
     links = segments.links[0]
     T = torch.eye(4, dtype=points.dtype, device=points.device).expand(len(points), hand.tree.n_links, 4, 4)
     T = T.index_copy(1, links, poses)
@@ -106,19 +93,18 @@ def decode(
 
 def decode_segments(
     segments: Segments, distances: Float[Tensor, "b n m"], object_points: Float[Tensor, "b m 3"],
-    config: DecodeConfig | None = None, among: Int[Tensor, " k"] | None = None,
+    among: Int[Tensor, " k"] | None = None,
 ) -> tuple[Float[Tensor, "b l 4 4"], Float[Tensor, "b l"], Float[Tensor, "b n 3"]]:
     """Poses of links of hands that may differ, what is left [m], and the clouds [m]; see `decode` and `LinkPoses`.
 
     The segments are those of each row, or of one hand for all; `among` is that of `multilaterate`.
     """
-    config = config or DecodeConfig()
     segments = segments.spread(len(distances))
-    both, flat = multilaterate(distances, object_points, config.multilateration, among)
+    both, flat = multilaterate(distances, object_points, among=among)
     points = both[:, 0]
     rows = flat.nonzero()[:, 0] if among is None else among
     if len(rows):
-        second = _sides(segments.rows(rows), both[rows].detach(), distances[rows].detach(), object_points[rows], config)
+        second = _sides(segments.rows(rows), both[rows].detach(), distances[rows].detach(), object_points[rows])
         second = second & flat[rows, None]
         points = points.index_put((rows,), torch.where(second[..., None], both[rows, 1], both[rows, 0]))
     poses, residual = register(segments.local, segments.of_points(points), segments.weight)
@@ -165,13 +151,13 @@ def _take(values: Float[Tensor, "b n *rest"], index: Int[Tensor, "b k"]) -> Floa
 
 def _sides(
     segments: Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
-    object_points: Float[Tensor, "b m 3"], config: DecodeConfig,
+    object_points: Float[Tensor, "b m 3"],
 ) -> Bool[Tensor, "b n"]:
     """Whether each hand point takes its second candidate, for grasps of flat objects."""
     candidates = torch.stack([segments.of_points(both[:, side]) for side in (0, 1)], 1)
     misfit = torch.stack([
         segments.of_points(distance_misfit(both[:, side], distances, object_points)) for side in (0, 1)], 1)
-    chosen = choose_sides(segments.local, segments.weight, candidates, misfit, segments.palm, config.sides)
+    chosen = choose_sides(segments.local, segments.weight, candidates, misfit, segments.palm)
     return chosen.flatten(1).gather(1, segments.place) & segments.kept
 
 

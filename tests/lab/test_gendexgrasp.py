@@ -157,8 +157,8 @@ def test_training_makes_a_method_that_the_benchmark_takes(bundle, home: Path, tm
     weights = tmp_path / "maps.safetensors"
     train.train("gendexgrasp", home / "bundle.safetensors", tmp_path / "run", weights, steps=1)
     assert weights.stat().st_size < 3_000_000
-    named = make_method("lab.methods.gendexgrasp:GenDexGraspGamma1")
-    assert named.name == "gendexgrasp-gamma1"
+    named = make_method("lab.methods.gendexgrasp:GenDexGrasp")
+    assert named.name == "gendexgrasp"
     assert len(named.propose(GraspProblem(toy_hand(), load_object("sphere")), 1, 3)) == 1
     method = map_method.GenDexGrasp(weights)
     grasps = method.propose(GraspProblem(toy_hand(), load_object("sphere")), 2, 3)

@@ -16,7 +16,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.training.runs import recalibrate
 from lab.methods.gendexgrasp.map_fitting import FittingConfig
-from lab.methods.gendexgrasp.map_method import ContactMapMethod
+from lab.methods.gendexgrasp.map_method import GenDexGrasp
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
 from tests.helpers.toy_hand import toy_hand
 
@@ -44,15 +44,15 @@ def obj() -> ObjectModel:
     return box(np.zeros(3))
 
 
-def quick(weights: Path, steps: int = 2, particles: int = 3) -> ContactMapMethod:
-    return ContactMapMethod(weights, "mine", FittingConfig(particles=particles, steps=steps, hand_points=48))
+def quick(weights: Path, steps: int = 2, particles: int = 3) -> GenDexGrasp:
+    return GenDexGrasp(weights, FittingConfig(particles=particles, steps=steps, hand_points=48))
 
 
 def test_grasps_are_of_the_hand_on_the_object_and_the_seed_repeats_them(weights: Path, obj: ObjectModel) -> None:
     hand, method = toy_hand(), quick(weights)
     grasps, again, other = (method.propose(GraspProblem(hand, obj), 5, seed) for seed in (3, 3, 4))
     assert (len(grasps), grasps.hand, set(grasps.object), grasps.joint_names) == (5, "toy", {obj.name}, hand.tree.joint_names)
-    assert set(grasps.provenance) == {"GenDexGrasp mine"}
+    assert set(grasps.provenance) == {"GenDexGrasp gendexgrasp"}
     assert set(grasps.seed.tolist()) == {3}
     assert not bool(grasps.evaluated.any())
     assert not bool(grasps.score.isfinite().any()), "nothing is ranked"
@@ -82,7 +82,7 @@ def test_descents_lower_the_energy_that_is_told(weights: Path, obj: ObjectModel)
 
 def test_missing_and_foreign_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=r"none\.safetensors"):
-        ContactMapMethod(tmp_path / "none.safetensors")
+        GenDexGrasp(tmp_path / "none.safetensors")
     save_weights(torch.nn.Linear(2, 2), tmp_path / "other.safetensors")
     with pytest.raises(WeightsError, match="use weights made with this version"):
-        ContactMapMethod(tmp_path / "other.safetensors")
+        GenDexGrasp(tmp_path / "other.safetensors")

@@ -14,7 +14,7 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from dro_grasp.geometry.contact_forces import friction_cone
+from dro_grasp.geometry.contact_forces import GRAVITY, friction_cone
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.effort import find_efforts
@@ -23,7 +23,7 @@ from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.simulation import payload as module
 from dro_grasp.simulation.forces import find_forces, largest_payload
 from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, press
-from dro_grasp.simulation.payload import GRAVITY, PayloadConfig, Squeezes, generators, given_way, payloads, servo_torques
+from dro_grasp.simulation.payload import PayloadConfig, Squeezes, generators, given_way, payloads, servo_torques
 from dro_grasp.simulation.pressure import Pressing
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import RAMP

@@ -10,13 +10,13 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
+from dro_grasp.geometry.contact_forces import LEVER
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import grasp_state as module
 from dro_grasp.simulation.grasp_state import (
     CHANGE,
-    LEVER,
     NO_ANSWER,
     PUSH,
     ContactForces,

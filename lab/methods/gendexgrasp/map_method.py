@@ -11,7 +11,7 @@ from dro_grasp.network.checkpoints import load_into
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
 from lab.methods import WEIGHTS
-from lab.methods.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA, sharpened
+from lab.methods.gendexgrasp.contact_maps import sharpened
 from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
 
@@ -19,16 +19,18 @@ POINTS = 256
 """Object points of a map, as many as in training (GenDexGrasp: 2,048)."""
 
 
-class ContactMapMethod(Source):
+class GenDexGrasp(Source):
     """GenDexGrasp: one map a grasp; of its particles the one of lowest energy. Nothing is refined, ranked or settled."""
 
-    def __init__(self, weights: Path, name: str = "gendexgrasp", config: FittingConfig | None = None) -> None:
+    name = "gendexgrasp"
+
+    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors", config: FittingConfig | None = None) -> None:
         """Load the weights.
 
         Raises:
             WeightsError: They are missing or of another network.
         """
-        self.name, self.config = name, config or FittingConfig()
+        self.config = config or FittingConfig()
         self.network = load_into(ContactMapNetwork(), weights)
 
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
@@ -44,17 +46,3 @@ class ContactMapMethod(Source):
         T, q, energy = fit(hand, MapTarget(points, normals, goals, problem.obj.distance_field), self.config, generator)
         return GraspBatch.create(
             problem.hand, problem.obj, T, q, energy=energy, seed=seed, provenance=f"GenDexGrasp {self.name}")
-
-
-class GenDexGrasp(ContactMapMethod):
-    """The method with a gamma of 2, as GenDexGrasp's optimiser has it."""
-
-    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
-        super().__init__(weights, "gendexgrasp", FittingConfig(gamma=FITTING_GAMMA))
-
-
-class GenDexGraspGamma1(ContactMapMethod):
-    """The method with a gamma of 1, as in its training."""
-
-    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
-        super().__init__(weights, "gendexgrasp-gamma1", FittingConfig(gamma=TRAINING_GAMMA))

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from dro_grasp.graphs import repeat
 
+GRAVITY = 9.81  # [m/s^2]
+LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
+
 
 def nonnegative_least_squares(
     a: Float[Tensor, "n m k"], b: Float[Tensor, "n m *c"], ridge: float, iterations: int

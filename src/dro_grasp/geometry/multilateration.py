@@ -77,9 +77,9 @@ def multilaterate(
     return both + cloud.centre[..., None, :, :], flat
 
 
-def thin_rows(anchors: Float[Tensor, "b m 3"], room: int, config: MultilaterationConfig | None = None) -> Int[Tensor, " k"]:
+def thin_rows(anchors: Float[Tensor, "b m 3"], room: int) -> Int[Tensor, " k"]:
     """So many rows of a batch, among them those of all thin clouds; all rows where there is not room enough. It waits."""
-    config = config or MultilaterationConfig()
+    config = MultilaterationConfig()
     flat = _spread(anchors, config).variance < config.thin**2
     order = flat.to(torch.uint8).argsort(descending=True, stable=True)
     return order[:room] if int(flat.sum()) <= room else order
@@ -215,20 +215,16 @@ def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*#b m 3"
     return squared.clamp(min=1e-10).sqrt()
 
 
-@dataclass(frozen=True)
-class SideConfig(Checked):
-    """Settings of the choice. Values are ours."""
-
-    rounds: int = 4  # rounds in which each point picks its nearer candidate and the body is registered again
-    reference_margin: float = 0.8
-    """Factor on the error of a solution on the reference body's side, so that it wins if both sides fit alike."""
-    ridge: float = 1e-6  # regularises the fit of the heights [1]; lengths are in units of the body's size there
+ROUNDS = 4  # Rounds in which each point picks its nearer candidate and the body is registered again (ours)
+REFERENCE_MARGIN = 0.8
+"""Factor on the error of a solution on the reference body's side, so that it wins if both sides fit alike (ours)."""
+HEIGHT_RIDGE = 1e-6  # Regularises the fit of the heights [1]; lengths are in units of the body's size there (ours)
 
 
 @torch.no_grad()
 def choose_sides(
     local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], reference: int | Int[Tensor, " b"], config: SideConfig | None = None,
+    misfit: Float[Tensor, "b 2 l p"], reference: int | Int[Tensor, " b"],
 ) -> Bool[Tensor, "b l p"]:
     """Whether each point takes its second candidate.
 
@@ -240,23 +236,22 @@ def choose_sides(
     Points of l bodies, the same for all clouds or of each, are in their own frames [m], with weight 0 for padding; misfits at
     their candidates [m^2] are mean squares.
     """
-    config = config or SideConfig()
-    cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)
+    cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2)
     starts = (torch.zeros_like(cut), torch.ones_like(cut), cut, ~cut)
     weight = weight.expand(len(candidates), -1, -1)[:, None]
     local = local.expand(len(candidates), -1, -1, -1)
-    picks, errors = _settle(local, weight, candidates, misfit, torch.stack(starts, 1), config)
+    picks, errors = _settle(local, weight, candidates, misfit, torch.stack(starts, 1))
     mostly_second = (picks * weight).sum(-1) > 0.5 * weight.sum(-1)
     reference = torch.as_tensor(reference, device=errors.device).expand(len(errors))[:, None, None].expand(-1, len(starts), 1)
     best = errors.gather(2, reference)[..., 0].argmin(1)
     side = mostly_second.gather(2, reference)[..., 0].gather(1, best[:, None])
     agrees = mostly_second == side[..., None]
-    best = torch.where(agrees, errors * config.reference_margin, errors).argmin(1)
+    best = torch.where(agrees, errors * REFERENCE_MARGIN, errors).argmin(1)
     return picks.gather(1, best[:, None, :, None].expand(-1, 1, -1, picks.shape[-1]))[:, 0]
 
 
 def _cut(
-    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], height: Float[Tensor, "b l p"], config: SideConfig
+    local: Float[Tensor, "*#b l p 3"], weight: Float[Tensor, "*#b l p"], height: Float[Tensor, "b l p"]
 ) -> Bool[Tensor, "b l p"]:
     """Side of the plane for each point of each body, up to exchanging the sides."""
     # A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So h^2 = (x,
@@ -268,7 +263,7 @@ def _cut(
     x = torch.cat([centred / size, torch.ones_like(local[..., :1])], -1)
     rows, columns = torch.triu_indices(4, 4, device=local.device)
     products = x[..., rows] * x[..., columns] * (2 - (rows == columns).to(x)) * weight[..., None]
-    normal = products.mT @ products + config.ridge * torch.eye(10, dtype=x.dtype, device=x.device)
+    normal = products.mT @ products + HEIGHT_RIDGE * torch.eye(10, dtype=x.dtype, device=x.device)
     squares = (height / size[..., 0]).square() * weight
     fit = torch.linalg.solve_ex(normal, products.mT @ squares[..., None]).result[..., 0]  # without waiting for its success
     matrix = fit.new_zeros(*fit.shape[:-1], 4, 4)
@@ -280,12 +275,12 @@ def _cut(
 
 def _settle(
     local: Float[Tensor, "b l p 3"], weight: Float[Tensor, "b 1 l p"], candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b s l p"], config: SideConfig,
+    misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b s l p"],
 ) -> tuple[Bool[Tensor, "b s l p"], Float[Tensor, "b s l"]]:
     """Alternate between picking and registering from each start; returns the picks and each body's mean squared error [m^2]."""
     local, weight = local[:, None].expand(*second.shape, 3), weight.expand(second.shape)
     away = misfit[:, None]
-    for _ in range(config.rounds):
+    for _ in range(ROUNDS):
         points = torch.where(second[..., None], candidates[:, None, 1], candidates[:, None, 0])
         T, _ = register(local, points, weight)
         posed = apply_to_cloud(T, local)

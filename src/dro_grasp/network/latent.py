@@ -11,6 +11,7 @@ from dro_grasp.graphs import repeat
 from dro_grasp.network.encoder import SLOPE, EdgeLayer, Graph, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0  # Log-variances of z are clamped to plus and minus this. Source: ours
+LAYERS = 3  # Of points whose values a second input scales and shifts. Source: ours
 CERTAIN = -4.0  # Log-variance of the posterior of an untrained motion code. Source: ours
 
 
@@ -166,10 +167,10 @@ class Modulated(nn.Module):
     Source: feature-wise linear modulation, Perez et al. 2018.
     """
 
-    def __init__(self, inputs: int, control: int, width: int, depth: int = 3) -> None:
+    def __init__(self, inputs: int, control: int, width: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(nn.Linear(inputs if i == 0 else width, width) for i in range(depth))
-        self.controls = nn.ModuleList(nn.Linear(control, 2 * width) for _ in range(depth))
+        self.layers = nn.ModuleList(nn.Linear(inputs if i == 0 else width, width) for i in range(LAYERS))
+        self.controls = nn.ModuleList(nn.Linear(control, 2 * width) for _ in range(LAYERS))
 
     def forward(self, x: Float[Tensor, "*#b n c"], control: Float[Tensor, "*#b k d"]) -> Float[Tensor, "*b n width"]:
         """Values of the points; the control is one for all or one for each of them, and batch axes broadcast."""

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import Rows, on_device
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.geometry.se3 import apply, compose, roma, rotate
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.kinds import Checked
@@ -400,7 +401,6 @@ class PinchEnergy:
                           base.by_joint + by_joint * self.hand.movable.to(q.dtype), base.pivot)
 
 
-GRAVITY = 9.81  # [m/s^2]
 SMOOTH = 0.0005  # Distance within which the pull on a pad fades [m] (ours)
 
 

@@ -223,18 +223,18 @@ class GraspPredictor:
         return [asking.result() for asking in under_way]
 
     @torch.no_grad()
-    def rounds(self, problem: GraspProblem, request: GraspRequest, progress: Progress | None = None) -> Iterator[GraspBatch]:
+    def rounds(self, problem: GraspProblem, request: GraspRequest) -> Iterator[GraspBatch]:
         """Grasps as they become known: after each round in which sources were asked, the best of what was not yielded yet.
 
-        For those who need one good grasp soon and know by themselves which is: who has it asks for no further round. Arguments
-        and errors are those of `run`; where nothing is found at all, no batch comes before the error.
+        For those who need one good grasp soon and know by themselves which is: who has it asks for no further round. Errors
+        are those of `run`; where nothing is found at all, no batch comes before the error.
 
         Yields:
             Complete grasps with scores, the best score first; as many as were asked for at most.
         """
         asking, shown = _Asking(self, problem, request), torch.zeros(0, dtype=torch.bool)
         for wanted in asking.rounds(*self._roles(problem, request)):
-            _take([asking], [wanted], progress)
+            _take([asking], [wanted], None)
             done = asking.done
             assert done is not None
             shown = torch.cat([shown, shown.new_zeros(len(done.pool) - len(shown))])

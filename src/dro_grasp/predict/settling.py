@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import on_accelerator
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CARRYING, PER_JOINT
 from dro_grasp.hands.effort import find_efforts
@@ -48,7 +49,6 @@ DOUBTS = (AWAY, DEEP, JAMMED, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
 """What closing shows against a grasp, in the order in which the first is told."""
 WEIGHTS = 4.0  # Weights of the object by which it may be pressed without any torque (ours)
 SLIGHT = 5.0  # Force that counts as nothing [N] (ours)
-GRAVITY = 9.81  # [m/s^2]
 
 
 @dataclass(frozen=True)

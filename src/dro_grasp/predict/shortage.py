@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from dro_grasp.geometry import se3
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
@@ -23,7 +24,6 @@ from dro_grasp.simulation.protocols import CARRY
 POSTURES = 17  # Postures from open to closed in which fingertips are compared (ours)
 LINES = 400  # Directions along which an object is measured (ours)
 ACROSS = 0.2  # Largest cosine between a direction and those that count as across it (ours)
-GRAVITY = 9.81  # [m/s^2]
 LEAST_LEVER = 1e-3  # Joints with a shorter lever do not bend the finger [m] (ours)
 HALF = 0.5  # Openness in which the force of fingertips is looked at (ours)
 

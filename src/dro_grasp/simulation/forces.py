@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.effort import find_efforts
@@ -21,7 +22,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
 from dro_grasp.simulation.outcome import FORCES
-from dro_grasp.simulation.payload import GRAVITY, PayloadConfig, Squeezes, generators, payloads, servo_torques
+from dro_grasp.simulation.payload import PayloadConfig, Squeezes, generators, payloads, servo_torques
 from dro_grasp.simulation.pressure import ContactForces, contact_forces
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts

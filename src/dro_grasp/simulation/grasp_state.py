@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import Rows
-from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
+from dro_grasp.geometry.contact_forces import GRAVITY, LEVER, friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
@@ -31,7 +31,6 @@ from dro_grasp.simulation.trial import held
 CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
 PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
 FRICTION_SHARE = 0.5  # Share of the friction that the answer may use (ours)
-LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
 CHANGE = 0.3  # Cost of doubling or dropping the force of a contact, beside an unanswered push of UNIT (ours)
 UNIT = 10.0  # Acceleration of the object by which pushes and the forces of contacts are measured [m/s^2] (ours)
 EDGES = 6  # Edges of a friction cone (ours)
@@ -211,7 +210,7 @@ def _pulled(rollout: Rollout, closed: ObjectState, config: WeightConfig) -> Floa
     farthest, largest = min(rules.max_displacement, LOST_DISTANCE), rules.max_rotation
     alive = closed.stable & (closed.shift(rollout.start) < farthest) & (closed.turn(rollout.start) < largest)
     pulls = Pulls(
-        config.pull * config.gravity, config.pulling, reset=True, from_start=True, farthest=farthest, largest_turn=largest)
+        config.pull * GRAVITY, config.pulling, reset=True, from_start=True, farthest=farthest, largest_turn=largest)
     moved, turned, _ = rollout.push(closed, alive, pulls)
     gave = np.stack([np.nan_to_num(moved, nan=LOST_DISTANCE).max(1), np.nan_to_num(turned, nan=np.pi).max(1)], 1)
     return torch.from_numpy(gave).float()
@@ -241,8 +240,6 @@ class WeightConfig(Checked):
 
     margin: float = 1.5
     """Multiple of the weight that is held whichever way gravity pulls; 0 squeezes light and heavy things alike."""
-    gravity: float = 9.81
-    """[m/s^2]"""
     friction: float = 0.5
     """Coefficient of friction that the forces rely on."""
     contacts: int = 12
@@ -295,7 +292,7 @@ def weight_forces(touch: Pressing, mass: Float[Tensor, " n"], config: WeightConf
     amounts = nonnegative_least_squares(wrench, goal, SMALLEST, config.iterations)
     able = (wrench @ amounts - goal).norm(dim=1).amax(1) < config.missing
     mean = amounts.mean(-1).unflatten(1, (k, config.edges))
-    return (config.margin * config.gravity * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
+    return (config.margin * GRAVITY * mass * able)[:, None, None] * (mean[..., None] * cone).sum(-2)
 
 
 def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:

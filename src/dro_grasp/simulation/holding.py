@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.simulation.payload import GRAVITY, servo_torques
+from dro_grasp.simulation.payload import servo_torques
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import object_mass, scene_of

@@ -22,6 +22,7 @@ from dro_grasp.simulation.protocols import Protocol
 FORCES = np.concatenate([np.eye(3), -np.eye(3)])  # Directions of the forces, in the object's frame
 DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")  # Their names, in the same order
 LOST_DISTANCE = 0.1  # An object that moves this far counts as lost [m]. Ours
+FEWEST_LINKS = 2  # Links that must touch the object after closing; with fewer, a success is a cage or luck. Ours
 
 
 class Failure(Enum):

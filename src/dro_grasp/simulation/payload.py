@@ -15,16 +15,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import Rows
-from dro_grasp.geometry.contact_forces import friction_cone
+from dro_grasp.geometry.contact_forces import GRAVITY, LEVER, friction_cone
 from dro_grasp.hands.effort import find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.pressure import Pressing, by_link
 from dro_grasp.simulation.protocols import Protocol
-
-GRAVITY = 9.81  # [m/s^2]
-LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,12 @@ class Bone:
     beyond: float  # How far the finger goes on from there [m]
 
 
-def pierced(scene: TrialScene, qpos: Float[np.ndarray, "n nq"], workers: int | None = None) -> Float[np.ndarray, " n"]:
+def pierced(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, " n"]:
     """How much of a finger is behind a surface that its axis crosses, in each configuration [m]; 0 where none crosses."""
     fingers = bones(scene)
     if not fingers or not len(qpos):
         return np.zeros(len(qpos))
-    batch = mujoco.batch.Batch(scene.model, nsim=len(qpos), nthread=min(workers or cores(), len(qpos)))
+    batch = mujoco.batch.Batch(scene.model, nsim=len(qpos), nthread=min(cores(), len(qpos)))
     start, along = _in_place(fingers, qpos, batch)
     groups = (np.arange(mujoco.mjNGROUP) == OBJECT_GROUP).astype(np.uint8)
     hit = batch.ray(start, along, groups, False)[0]

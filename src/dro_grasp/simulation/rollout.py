@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from dro_grasp.devices import Rows, cores
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import table_planes
 from dro_grasp.grasps.controller import complete
@@ -31,7 +32,6 @@ RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targ
 CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
 DEVICE_CHUNK = 4096  # The same on a device. Ours: a step takes 1.6 ms for 1,024 worlds and 2.0 for 2,048 on an H100
 FEW = 64  # Fewer grasps run on the processor, which is done before a device has begun (ours)
-GRAVITY = 9.81  # What presses an object on a table while the hand closes [m/s^2]
 CLOSINGS = 1024
 """Closings that a scene keeps (ours), each of some hundred bytes: grasps repeat theirs as they are weighed and tried."""
 

@@ -218,7 +218,7 @@ def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tenso
 
 
 def after_closing(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL
 ) -> GraspBatch:
     """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
 
@@ -226,7 +226,7 @@ def after_closing(
     of `simulate`.
     """
     scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
-    for part, rollout in rollouts(scene, hand, grasps, workers):
+    for part, rollout in rollouts(scene, hand, grasps):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         parts.append(_reached(part, rollout, hand, sound))

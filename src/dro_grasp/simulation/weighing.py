@@ -15,13 +15,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.grasp_state import WeightConfig, squeezes_of
 from dro_grasp.simulation.outcome import FORCES
-from dro_grasp.simulation.payload import GRAVITY, Squeezes
+from dro_grasp.simulation.payload import Squeezes
 from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Moment, ObjectState, Rollout, rollouts_of_all

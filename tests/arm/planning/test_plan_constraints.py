@@ -148,12 +148,12 @@ class Listener(dro.GraspPredictor):
     def __init__(self) -> None:
         self.device, self.asked, self.room = "cpu", list[float | None](), list[float | None]()
 
-    def run(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Prediction:
+    def run(self, problem: GraspProblem, request: dro.GraspRequest) -> Prediction:
         self.asked.append(request.least_confidence)
         self.room.append(problem.constraints.pregrasp_clearance)
         raise NoGraspError("nothing is made")
 
-    def rounds(self, problem: GraspProblem, request: dro.GraspRequest, progress: object = None) -> Iterator[dro.GraspBatch]:
+    def rounds(self, problem: GraspProblem, request: dro.GraspRequest) -> Iterator[dro.GraspBatch]:
         self.run(problem, request)
         yield from ()
 

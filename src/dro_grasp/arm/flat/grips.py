@@ -18,6 +18,7 @@ from jaxtyping import Float
 from dro_grasp.arm.flat.postures import AHEAD, FlatGrip, WorkingHand, flat_grips, pressing
 from dro_grasp.arm.flat.things import overhang
 from dro_grasp.arm.robots.robot import Table
+from dro_grasp.geometry.contact_forces import GRAVITY
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -31,7 +32,6 @@ PRESSES = 7.0
 """Multiple of the weight with which thumb and fingers press (ours): what is held at one end turns about the fingers."""
 LEAST_FORCE = 8.0  # Least such force [N] (ours)
 MOST_FORCE = 25.0  # Largest such force [N] (ours)
-GRAVITY = 9.81  # [m/s^2]
 TILTED = 0.3  # Cost of a radian between the palm and the edge (ours)
 
 Grip = tuple[float, Float[np.ndarray, "4 4"], FlatGrip, torch.Tensor]  # Cost, T_world_wrist [m], the hand, and its squeeze

@@ -94,13 +94,13 @@ class WorkingHand:
         return self.points(q)[self.rows(finger)[self.is_tip(finger)]]
 
     def seek(
-        self, finger: int, cost: Cost, start: Float[Tensor, " n_dof"], anywhere: bool = True, seed: int = 0
+        self, finger: int, cost: Cost, start: Float[Tensor, " n_dof"], anywhere: bool = True
     ) -> tuple[Float[Tensor, " n_dof"], float]:
         """Joints with the posture of a finger that costs least, and that cost; others stay as at the start.
 
         The search begins anywhere, or around the start.
         """
-        hand, generator, config = self.hand, torch.Generator().manual_seed(seed), self.config
+        hand, generator, config = self.hand, torch.Generator().manual_seed(0), self.config
         rows, own, span = self.rows(finger), hand.finger_joints[finger] & hand.movable, hand.upper - hand.lower
         links, is_tip, best, least = hand.link_index[rows], self.is_tip(finger), start, float("inf")
         for number in range(config.rounds + 1):

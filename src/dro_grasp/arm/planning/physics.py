@@ -26,6 +26,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
+from dro_grasp.simulation.outcome import FEWEST_LINKS
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 from dro_grasp.simulation.quiet import quiet
 from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, servo_joints
@@ -49,7 +50,6 @@ STEADY = 0.005 * np.array([(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)])
 """Corners of the least foot of an estimated object, about what is below its centre of mass [m] (ours)."""
 FALLEN = 0.02  # Depth from which on what was pushed fell off the table [m] (ours)
 TIPPING_SECONDS = 0.5  # What tips over an edge takes its time [s] (ours)
-FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,10 @@ class Mesh:
     colour: Colour  # before shading
 
 
-def arrow(
-    start: Num[np.ndarray, "3"], end: Num[np.ndarray, "3"], colour: Colour, radius: float = 0.002, sides: int = 12
-) -> Mesh:
+SIDES = 12  # Of an arrow
+
+
+def arrow(start: Num[np.ndarray, "3"], end: Num[np.ndarray, "3"], colour: Colour, radius: float = 0.002) -> Mesh:
     """A shaft with a head, from `start` to `end` [m]."""
     along = np.asarray(end, float) - np.asarray(start, float)
     length = float(np.linalg.norm(along))
@@ -37,14 +38,14 @@ def arrow(
     forward = along / max(length, 1e-12)
     side = unit(np.cross(forward, np.eye(3)[np.abs(forward).argmin()]))
     other = np.cross(forward, side)
-    angles = np.arange(sides) * 2 * np.pi / sides
+    angles = np.arange(SIDES) * 2 * np.pi / SIDES
     ring = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * other
     vertices = np.concatenate([np.asarray(start) + z * forward + r * ring for z, r in profile])
-    i = np.arange(sides)
-    j = (i + 1) % sides
+    i = np.arange(SIDES)
+    j = (i + 1) % SIDES
     # Two triangles per side between each ring of the profile and the next.
-    quads = [np.stack([[a * sides + i, a * sides + j, a * sides + j + sides],
-                       [a * sides + i, a * sides + j + sides, a * sides + i + sides]]).transpose(0, 2, 1).reshape(-1, 3)
+    quads = [np.stack([[a * SIDES + i, a * SIDES + j, a * SIDES + j + SIDES],
+                       [a * SIDES + i, a * SIDES + j + SIDES, a * SIDES + i + SIDES]]).transpose(0, 2, 1).reshape(-1, 3)
              for a in range(len(profile) - 1)]
     return Mesh(vertices, np.concatenate(quads), colour)
 
@@ -186,10 +187,10 @@ class _Canvas:
 
 
 def render(
-    meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = (1.0, 1.0, 1.0),
-    oversampling: int = 2, style: Style | None = None,
+    meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, oversampling: int = 2,
+    style: Style | None = None,
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Draw meshes with perspective, smooth shading and soft outlines; `oversampling` is the samples per pixel and axis."""
+    """Draw meshes with perspective, smooth shading and soft outlines, on white; `oversampling` samples a pixel and axis."""
     style = style or Style()
     samples = width * height * oversampling**2
     canvas = _Canvas(width * oversampling, height * oversampling, np.zeros(samples), np.zeros(samples, np.int64))
@@ -197,7 +198,7 @@ def render(
     rows = _rows(triangles, canvas)
     for start in range(0, len(rows), ROWS_AT_ONCE):
         _draw(rows[start : start + ROWS_AT_ONCE], triangles, canvas)
-    picture = _shaded(triangles, canvas, background, style).reshape(canvas.height, canvas.width, 3)
+    picture = _shaded(triangles, canvas, style).reshape(canvas.height, canvas.width, 3)
     with np.errstate(divide="ignore"):
         depth = (1 / canvas.inverse).astype(np.float32)
     picture *= outlines(depth.reshape(canvas.height, canvas.width), oversampling, style)[..., None]
@@ -260,8 +261,8 @@ def _draw(rows: Int[np.ndarray, "rows 2"], triangles: _Triangles, canvas: _Canva
     canvas.face[pixel[nearest]] = face[row[nearest]]
 
 
-def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: Style) -> Float[np.ndarray, "samples 3"]:
-    colours = np.broadcast_to(np.asarray(background, np.float32), (len(canvas.face), 3)).copy()
+def _shaded(triangles: _Triangles, canvas: _Canvas, style: Style) -> Float[np.ndarray, "samples 3"]:
+    colours = np.ones((len(canvas.face), 3), np.float32)
     shares = triangles.shares
     corners, normals_of, colours_of = (
         values.astype(np.float32) for values in (triangles.corners, triangles.normals, triangles.colours))

@@ -33,8 +33,8 @@ class OptimiserConfig(Checked):
     """Grasps that are optimised for each candidate; those of lowest energy are proposed."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The descent. The problem's constraints say where it starts."""
-    pinch: PinchConfig | None = field(default_factory=PinchConfig)
-    """How pinches are sought, which are proposed instead where the object lies flat on a table; None descends there too."""
+    pinch: PinchConfig = field(default_factory=PinchConfig)
+    """How pinches are sought, which are proposed instead where the object lies flat on a table."""
     farthest_direction: float = math.radians(20.0)
     """Largest angle between the palm direction of a candidate and the direction that was asked for [rad]."""
 
@@ -69,7 +69,7 @@ class OptimiserSource(Source):
 
     def _pinched(self, problem: GraspProblem, num: int, seed: int) -> Candidates | None:
         """Pinches of what lies flat on a table; None for other things, and where there are none."""
-        if problem.lies_flat and self.config.pinch is not None and len(found := pinch(problem, num, seed, self.config)):
+        if problem.lies_flat and len(found := pinch(problem, num, seed, self.config)):
             return replace(Candidates.of(problem, found, self.n_points), exact=True)
         return None
 
@@ -92,7 +92,6 @@ def pinch(problem: GraspProblem, num: int, seed: int, config: OptimiserConfig) -
         problem = GraspProblem(problem.hand, problem.obj, "cpu", problem.constraints)
     generator, wanted, table = torch.Generator().manual_seed(seed), problem.constraints, problem.table
     assert table is not None
-    assert config.pinch is not None
     energy = problem.energy(config.synthesis.energy)
     search = PinchSearch(energy, problem.mass, wanted.direction, wanted.max_tilt, config.pinch)
     pairs = opposed_pairs(problem.obj, table, search.widest(generator), config.pinch.pairs * num, config.pinch,

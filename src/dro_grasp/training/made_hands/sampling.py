@@ -229,9 +229,9 @@ class Dice:
         return bool(self.generator.random() < probability)
 
 
-def sample_plan(generator: np.random.Generator, population: Population | None = None) -> HandPlan:
+def sample_plan(generator: np.random.Generator) -> HandPlan:
     """Draw a plan. It may be of a hand that cannot grasp."""
-    dice = Dice(generator, population or Population())
+    dice = Dice(generator, Population())
     family = dice.among(dice.population.families)
     style, folds_back = _style(dice)
     draw = {"row": _row, "ring": _ring, "facing": _facing}[family]

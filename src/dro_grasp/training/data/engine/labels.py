@@ -18,11 +18,10 @@ from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig, Settled, settle_all
 from dro_grasp.simulation.grasp_state import WeightConfig
-from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.outcome import FEWEST_LINKS, TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate_many
 
-FEWEST_LINKS = 2  # Links that must touch the object; with fewer, a success is a cage or luck (ours)
 RESTLESS = "does not come to rest"
 """Reason that counts grasps which still move the object when the hand closes a second time, and therefore get no trial."""
 CHEAP = SettleConfig(weight=WeightConfig(pull=0))

@@ -30,16 +30,11 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.optimize.synthesis import Lot, SynthesisConfig, synthesize_all
+from dro_grasp.simulation.outcome import FEWEST_LINKS
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import hand_shift, settle_many, simulate_many
 from dro_grasp.training.data.bundle.training_file import split_of
-from dro_grasp.training.data.engine.labels import (
-    FEWEST_LINKS,
-    RESTLESS,
-    also_passing_of_all,
-    at_rest_of_all,
-    closed_where_they_hold,
-)
+from dro_grasp.training.data.engine.labels import RESTLESS, also_passing_of_all, at_rest_of_all, closed_where_they_hold
 from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, failure_of, notes_of
 
 ON_DEVICE = {"candidates": 512, "min_candidates": 256, "max_candidates": 1024, "candidate_budget": 65536, "together": 8}
