@@ -186,7 +186,7 @@ def settled(problem: GraspProblem, grasps: GraspBatch) -> None:
     for when in ("cold", "warm"):
         with timed() as seconds:
             begin = time.perf_counter()
-            stable = settling.settle_grasps(problem, grasps).stable
+            stable = settling.settle_all([problem], [grasps])[0].stable
             whole = time.perf_counter() - begin
         parts = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
         print(f"{when}: settled {len(grasps)} in {whole:.2f} s on {problem.device}, {len(grasps) / whole:.0f} a second, "

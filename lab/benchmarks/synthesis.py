@@ -24,7 +24,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
-from dro_grasp.training.data.engine.worker import EngineConfig, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, Wanted, valid_grasps_of_all
 from lab.benchmarks.report import emit
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
@@ -59,7 +59,7 @@ def measure(
         _ = obj.distance_field, obj.parts
         start = time.process_time()
         preparation += start - begin
-        grasps, _ = valid_grasps(hand, obj, seed, config)
+        (grasps, _), = valid_grasps_of_all(hand, [Wanted(obj, seed, config.candidates)], config)
         rows.append((name, len(grasps), time.process_time() - start))
         print(f"{hand_name} on {name}: {len(grasps)} grasps in {rows[-1][2]:.1f} CPU seconds", file=sys.stderr)
     return rows, preparation

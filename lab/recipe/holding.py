@@ -33,7 +33,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import SHIPPED_HOLDING, Evidence, HoldingScore, holding_features
 from dro_grasp.predict.score.score import SHIPPED, ScoreConfig
-from dro_grasp.predict.settling import settle_grasps
+from dro_grasp.predict.settling import settle_all
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine, scored
@@ -142,7 +142,7 @@ def tried(plan: Plan, name: str, rng: random.Random) -> Iterator[dict[str, Any]]
         yield {**about, "maker": f"{maker}, unsettled", "score": few.score,
                "outcomes": outcomes(problem, few, False), **columns(Evidence.none(len(few), obj.mass))}
         better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]
-        settled = settle_grasps(problem, better)
+        settled = settle_all([problem], [better])[0]
         yield {**about, "maker": maker, "score": scored(problem, settled.grasps, config).score,
                "outcomes": outcomes(problem, settled.grasps, costly), **columns(settled.known)}
 

@@ -38,7 +38,7 @@ from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.features import feature_names, grasp_features
 from dro_grasp.predict.score.score import SHIPPED, ScoreConfig, ScoreNetwork, save_score_network
-from dro_grasp.predict.settling import settle_grasps
+from dro_grasp.predict.settling import settle_all
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
@@ -143,7 +143,8 @@ def collect(plan: Plan, given: tuple[str, str]) -> tuple[list[dict[str, Any]], s
     best = refine(problem, OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps)
     # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
     whole = GraspProblem(hand, obj)
-    closed = {kind: settle_grasps(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
+    kinds = "settled", "optimised, settled"
+    closed = {kind: settle_all([whole], [grasps])[0] for kind, grasps in zip(kinds, (refined, best), strict=True)}
     some = refined[slice(0, num // 8)]
     opened = hand.canonical_joints(1.0).expand_as(some.joints)
     groups = {

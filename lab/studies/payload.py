@@ -28,7 +28,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import weigh_settled
+from dro_grasp.predict.settling import weigh_settled_all
 from dro_grasp.simulation.conditions import Conditions
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.forces import largest_payloads
@@ -97,7 +97,7 @@ def measure(hand_name: str, object_name: str, grasps: int, seed: int) -> Iterato
     state, _ = grasp_state(problem.hand, problem.obj, pressed, "carry", config=asked, workers=1)
     told = pressed.replace(payload=observed(pressed.payload, state.gave, problem.obj.mass))
     clock.append(time.process_time())
-    found = weigh_settled(problem, told, WeighingConfig(), rules)
+    found = weigh_settled_all([problem], [told], WeighingConfig(), rules)[0]
     clock.append(time.process_time())
     program = largest_payloads(pair.chosen, asked.payload)
     clock.append(time.process_time())

@@ -22,7 +22,7 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
-from dro_grasp.simulation.trial import record, settle, simulate
+from dro_grasp.simulation.trial import record, settle_many, simulate
 from dro_grasp.training.data.engine.worker import EngineConfig
 from tests.helpers.served_studio import Listener, asked, served_studio
 
@@ -60,7 +60,7 @@ def test_the_viewer_asks_for_what_the_command_asks(tmp_path) -> None:
         assert studio.protocol.value == DEFAULT_PROTOCOL
 
 
-@pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate])
+@pytest.mark.parametrize("function", [simulate, settle_many, record, evaluate, Evaluate])
 def test_trials_are_those_of_what_lifts_things_unless_another_protocol_is_named(function: Callable[..., Any]) -> None:
     assert default(function, "protocol") == DEFAULT_PROTOCOL == "carry"
 

@@ -36,7 +36,6 @@ from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.controls import StartSource, palm_facing_starts
 from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
@@ -47,6 +46,7 @@ from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.bench_clone import clone_of_bars
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle_grasps
 from tests.helpers.weights import untrained_weights
 
 AUTO, START, OPTIMISER = "auto", "start", "optimiser"

@@ -21,9 +21,10 @@ from dro_grasp.predict.settling import SettleConfig, settle_all, weigh_settled_a
 from dro_grasp.simulation.grasp_state import GraspState, grasp_state
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Perturbations, protocol
-from dro_grasp.simulation.trial import settle, simulate
-from dro_grasp.simulation.weighing import WeighingConfig, weigh
+from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.weighing import WeighingConfig
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle, weigh
 
 HAND = loaded_hand("gripper3")
 STORED = Path(__file__).with_suffix(".parquet")

@@ -52,7 +52,7 @@ def test_no_energy_rises_and_most_fall(obj: ObjectModel, disturbed: GraspBatch) 
     refined = refine_grasps(energy, disturbed)
 
     def total(grasps: GraspBatch) -> torch.Tensor:
-        contacts = energy.nearest_contacts(grasps.T_object_wrist, grasps.joints, CONFIG.reach)
+        contacts = energy.nearest_contacts(grasps.T_object_wrist[:, None] @ HAND.tree.forward(grasps.joints), CONFIG.reach)
         return energy(grasps.T_object_wrist, grasps.joints, contacts).total
 
     before, after = total(disturbed), total(refined)
@@ -97,9 +97,10 @@ def test_contacts_are_not_sought_with_fingers_out_of_reach() -> None:
     far = torch.eye(4)[None].clone()
     far[:, :3, 3] = 0.06
     q = HAND.canonical_joints(0.0)[None]
-    near = energy.nearest_contacts(far, q)
+    poses = far[:, None] @ HAND.tree.forward(q)
+    near = energy.nearest_contacts(poses)
     every = energy.candidates.fingers[near[0]]
-    reached = energy.nearest_contacts(far, q, reach=0.0)
+    reached = energy.nearest_contacts(poses, reach=0.0)
     one = energy.candidates.fingers[reached[0]]
     assert len(set(every.tolist())) > 1
     assert len(set(one.tolist())) == 1  # out of reach, all slots go to the finger that is nearest

@@ -13,8 +13,8 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.contacts import contact_candidates
 from dro_grasp.optimize.grasp_energy import GraspEnergy, link_spheres
-from dro_grasp.optimize.starts import StartConfig, starts
-from dro_grasp.optimize.synthesis import SynthesisConfig, depth, descend, synthesize
+from dro_grasp.optimize.starts import StartConfig, approach, draw_starts
+from dro_grasp.optimize.synthesis import Chances, SynthesisConfig, anneal, depth, synthesize
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
@@ -71,7 +71,8 @@ def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
     hand = toy_hand()
     energy = GraspEnergy.of_object(hand, ball)
     surface, config = torch.from_numpy(ball.cloud), StartConfig(gap=(0.002, 0.01))
-    T, q = starts(hand, energy.field, surface, energy.centre, 256, config, torch.Generator().manual_seed(0))
+    drawn = draw_starts(hand, surface, energy.centre, 256, config, torch.Generator().manual_seed(0))
+    T, q = approach(hand, energy.field, drawn, config)
     clearance = energy.field.distances(hand.points(q, T))[0].amin(-1)
     assert clearance.min() > 0  # [m]
     centres = energy.pivot(T)
@@ -86,9 +87,11 @@ def test_energy_falls_and_limits_hold(ball):
     hand = toy_hand()
     energy, surface = GraspEnergy.of_object(hand, ball, SHORT.energy, SHORT.contacts), torch.from_numpy(ball.cloud)
     generator = torch.Generator().manual_seed(0)
-    start = starts(hand, energy.field, surface, energy.centre, 32, SHORT.starts, generator)
-    before = descend(energy, *start, SynthesisConfig(steps=1), generator)
-    after = descend(energy, *start, SHORT, generator)
+    start = approach(
+        hand, energy.field, draw_starts(hand, surface, energy.centre, 32, SHORT.starts, generator), SHORT.starts)
+    before, after = (
+        anneal(energy, *start, config, Chances.draw(energy.candidates, 32, config, generator))
+        for config in (SynthesisConfig(steps=1), SHORT))
     assert after.result.total.median() < 0.4 * before.result.total.median()
     assert (after.q >= hand.tree.lower).all()
     assert (after.q <= hand.tree.upper).all()

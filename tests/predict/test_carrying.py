@@ -18,7 +18,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict import finish
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, settle_best, settle_grasps, weigh_settled, weight_config
+from dro_grasp.predict.settling import SettleConfig, weigh_settled_all, weight_config
 from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.forces import find_forces
 from dro_grasp.simulation.grasp_state import WeightConfig
@@ -26,6 +26,7 @@ from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import object_mass
 from dro_grasp.simulation.weighing import WeighingConfig
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle_best, settle_grasps
 from tests.helpers.weights import untrained_weights
 
 HAND, CAN = loaded_hand("gripper3"), dro.load_object("can")
@@ -112,7 +113,7 @@ def test_what_held_the_mass_as_it_settled_carries_it_at_least(grasps: dro.GraspB
         settled, rules, gave = found[stable], PROTOCOLS["carry"], known.state.gave[stable]
         held = (gave[:, 0] < rules.max_displacement) & (gave[:, 1] < rules.max_rotation)
         assert torch.equal(settled.payload >= obj.mass, held)
-        payload = weigh_settled(problem, settled, WeighingConfig(), SettleConfig())
+        payload = weigh_settled_all([problem], [settled], WeighingConfig(), SettleConfig())[0]
         assert torch.equal(payload >= obj.mass, held)
         assert not torch.equal(payload, settled.payload)
 

@@ -22,11 +22,12 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding import Evidence, holding_score
-from dro_grasp.predict.settling import SettleConfig, settle_grasps
+from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle_grasps
 
 HAND, CAN = loaded_hand("gripper3"), load_object("can")
 WHOLE = GraspProblem(HAND, CAN)

@@ -35,15 +35,14 @@ from dro_grasp.predict.settling import (
     doubts,
     effort_share,
     is_jammed,
-    settle_best,
-    settle_grasps,
 )
-from dro_grasp.predict.stages import evaluate, grip, refine, scored
+from dro_grasp.predict.stages import evaluate, grip_all, refine, scored
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import Squeeze, press
 from dro_grasp.simulation.outcome import Failure
-from dro_grasp.simulation.trial import hand_shift, settle, simulate
+from dro_grasp.simulation.trial import hand_shift, simulate
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle, settle_best, settle_grasps
 
 HAND, CAN = loaded_hand("gripper3"), load_object("can")
 PROBLEM = GraspProblem(HAND, CAN)
@@ -81,7 +80,7 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
     assert min(int(rows.sum()) for rows in (still, pushed, lost)) > 0
     found, stable, known, _ = outcome
     assert bool(stable[still].all()), "with this can they are not deep either"
-    pressed = press(HAND, CAN, grip(PROBLEM, closed[still], RefineConfig()), "strict")
+    pressed = press(HAND, CAN, grip_all([PROBLEM], [closed[still]], RefineConfig())[0], "strict")
     for name in ("T_object_wrist", "joints", "squeeze_joints"):
         torch.testing.assert_close(getattr(found, name)[still], getattr(pressed, name))
     assert (found.squeeze_joints[still] - many.squeeze_joints[still]).abs().amax(1).min() > 1e-4, "it squeezes anew"

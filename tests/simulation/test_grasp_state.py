@@ -23,7 +23,7 @@ from dro_grasp.simulation.grasp_state import (
     WeightConfig,
     grasp_state,
     press,
-    pressed,
+    pressed_many,
     squeezes_of,
     unanswered,
 )
@@ -172,7 +172,7 @@ def test_payloads_of_some_rows_are_those_of_all(hand: Hand, obj: ObjectModel, mo
     T = grasps.T_object_wrist.clone()
     T[:, 2, 3] -= torch.tensor([0.0, 0.003, 0.006])
     grasps = grasps.replace(T_object_wrist=T)
-    every, done = press(hand, obj, grasps, "carry"), pressed(hand, obj, grasps, "carry")
+    every, done = press(hand, obj, grasps, "carry"), pressed_many(hand, [obj], [grasps], "carry")
     found = done.payloads(rows)
     assert torch.equal(found.isnan(), ~rows)
     torch.testing.assert_close(found[rows], every.payload[rows])

@@ -25,9 +25,10 @@ from dro_grasp.simulation.outcome import LOST_DISTANCE, TrialResult
 from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.rollout import rollouts_of_all
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-from dro_grasp.simulation.trial import hand_shift, settle, settle_many, simulate, simulate_many
-from dro_grasp.simulation.weighing import WeighingConfig, weigh, weigh_many
+from dro_grasp.simulation.trial import hand_shift, settle_many, simulate, simulate_many
+from dro_grasp.simulation.weighing import WeighingConfig, weigh_many
 from dro_grasp.simulation.worlds import WARP
+from tests.helpers.one_object import settle, weigh
 from tests.helpers.steady_grasps import HAND, WANTED, steady_grasps
 from tests.helpers.warp_steps import Steps, take_absent_shapes_away
 

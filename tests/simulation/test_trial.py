@@ -21,9 +21,10 @@ from dro_grasp.simulation import rollout as rollouts
 from dro_grasp.simulation.grasp_state import grasp_state
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
-from dro_grasp.simulation.trial import TrialResult, after_closing, record, settle, simulate
+from dro_grasp.simulation.trial import TrialResult, after_closing, record, simulate
 from tests.helpers.claw import claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle
 
 
 def same(a: TrialResult, b: TrialResult) -> None:

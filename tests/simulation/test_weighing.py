@@ -18,8 +18,9 @@ from dro_grasp.simulation.payload import PayloadConfig
 from dro_grasp.simulation.protocols import CARRY
 from dro_grasp.simulation.rollout import ObjectState, Rollout
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed, weigh
+from dro_grasp.simulation.weighing import LESS, WeighingConfig, observed
 from tests.helpers.claw import power_grasp
+from tests.helpers.one_object import weigh
 
 NOTHING_ADDED = WeightConfig(margin=0.0)
 FINE = WeighingConfig(rounds=8)

@@ -25,7 +25,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict import settling
 from dro_grasp.simulation import rollout as rollout_module, trial as trial_module, warp_worlds, worlds as worlds_module
-from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed, squeezes_of, unanswered
+from dro_grasp.simulation.grasp_state import WeightConfig, grasp_state, pressed_many, squeezes_of, unanswered
 from dro_grasp.simulation.joint_model import joint_model
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.payload import PayloadConfig, given_way, payloads
@@ -33,14 +33,14 @@ from dro_grasp.simulation.pressure import contact_forces
 from dro_grasp.simulation.protocols import CARRY, PROTOCOLS, Perturbations, Protocol, protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import cached_scene
-from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.simulation.trial import simulate
 from dro_grasp.simulation.warp_worlds import Room
-from dro_grasp.simulation.weighing import weigh
 from dro_grasp.simulation.worlds import STATE, WARP
 from dro_grasp.training.data.engine import worker
 from dro_grasp.training.data.engine.worker import EngineConfig, Wanted
 from tests.helpers.claw import grasps_of, power_grasp, wrist_below
 from tests.helpers.fake_device import fake_device
+from tests.helpers.one_object import settle, weigh
 from tests.helpers.steady_grasps import steady_grasps
 from tests.helpers.warp_steps import State, Steps
 
@@ -283,7 +283,7 @@ def test_a_gpu_judges_as_the_processor_does(monkeypatch: pytest.MonkeyPatch) -> 
     grasps = settle(hand, obj, _around(hand, obj))
     found = simulate(hand, obj, grasps, "strict", device="cuda", confirm=False)
     assert torch.equal(found.success, simulate(hand, obj, grasps, "strict").success)
-    pressed(hand, obj, grasps, device="cuda")
+    pressed_many(hand, [obj], [grasps], device="cuda")
 
 
 @pytest.mark.parametrize(("share", "seed", "kept", "judged"), [(1.0, 0, 3, 4), (0.5, 1, 3, 4), (0.5, 0, 4, 2)])
@@ -320,7 +320,7 @@ def test_a_shard_made_on_a_device_is_that_of_the_processor(
     config = EngineConfig("strict", also=("dro",), candidates=24, resettle=resettle, confirm=0.5, synthesis=SynthesisConfig(
         steps=60, batch_size=24, at_once=48))
     wanted = [Wanted(cube, 0, 24), Wanted(can, 1, 24)]
-    processor = [worker.valid_grasps(hand, one.obj, one.seed, config) for one in wanted]
+    processor = [worker.valid_grasps_of_all(hand, [one], config)[0] for one in wanted]
     assert not made.calls
     for module in (worlds_module, rollout_module, trial_module):
         monkeypatch.setattr(module, "on_processor", lambda device: device == "cpu")

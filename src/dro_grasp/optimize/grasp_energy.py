@@ -398,14 +398,14 @@ class GraspEnergy:
     ) -> Evaluation:
         """Energy and gradient of n grasps; their contacts are candidates by index, those nearest to the surface by default."""
         poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
-        return self._at(T_object_wrist, q, poses, self._nearest(poses, math.inf) if contacts is None else contacts)
+        return self._at(T_object_wrist, q, poses, self.nearest_contacts(poses, math.inf) if contacts is None else contacts)
 
     def of_nearest(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float
     ) -> Evaluation:
         """The same with the contacts of `nearest_contacts`."""
         poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
-        return self._at(T_object_wrist, q, poses, self._nearest(poses, reach))
+        return self._at(T_object_wrist, q, poses, self.nearest_contacts(poses, reach))
 
     def _at(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], poses: Float[Tensor, "n n_links 4 4"],
@@ -453,17 +453,11 @@ class GraspEnergy:
         distance, gradient = self.field.distances(placed)
         return placed.split(sizes, 1), distance.split(sizes, 1), gradient.split(sizes, 1)
 
-    def nearest_contacts(
-        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
-    ) -> Int[Tensor, "n c"]:
-        """The candidate of each slot that is nearest to the surface; slots do not share a candidate.
+    def nearest_contacts(self, poses: Float[Tensor, "n n_links 4 4"], reach: float = math.inf) -> Int[Tensor, "n c"]:
+        """The candidate of each slot that is nearest to the surface, of links at these poses; slots do not share a candidate.
 
         A slot without a candidate within `reach` [m] takes one from the slot that is nearest to the surface.
         """
-        return self._nearest(T_object_wrist[:, None] @ self.hand.tree.forward(q), reach)
-
-    def _nearest(self, poses: Float[Tensor, "n n_links 4 4"], reach: float) -> Int[Tensor, "n c"]:
-        """The same of hands whose links are at these poses [m]."""
         points = self.contact_points.place(poses)
         distance = self.field.distances(points)[0].abs()
         if self.region_term is not None:

@@ -141,25 +141,15 @@ class Drawn(Rows):
     back: Float[Tensor, " n"]  # how far back it begins [m]
 
 
-def starts(
-    hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, "3"], n: int, config: StartConfig,
-    generator: torch.Generator, surroundings: Surroundings | None = None,
-) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
-    """Wrist poses and joints to start from, on the CPU.
-
-    Each palm aims at a point between the object's centre and a random surface point [m], from a random side with a random roll,
-    and approaches until the hand is within the gap or the point is enclosed. In surroundings, more palms are turned than are
-    needed, those with most room start, and those that would start under a plane are lifted.
-    """
-    drawn = draw_starts(hand, surface, centre, n, config, generator, surroundings)
-    return approach(hand, field, drawn, config, surroundings)
-
-
 def draw_starts(
     hand: Hand, surface: Float[Tensor, "k 3"], centre: Float[Tensor, "3"], n: int, config: StartConfig,
     generator: torch.Generator, surroundings: Surroundings | None = None,
 ) -> Drawn:
-    """All that is drawn; arguments as of `starts`."""
+    """All that is random about n starts, drawn on the CPU.
+
+    Each palm aims at a point between the object's centre and a random surface point [m], from a random side with a random roll.
+    In surroundings, more palms are turned than are needed, and those with most room start.
+    """
     q = start_joints(hand, n, config, generator)
     wanted, middle = surface, centre
     if (place := Balls.of(config.contact_region)) is not None:
@@ -179,7 +169,10 @@ def approach(
     hand: Hand, field: DistanceField | DistanceFields, drawn: Drawn, config: StartConfig,
     surroundings: Surroundings | None = None,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
-    """Where hands start that were drawn; everything is on one device."""
+    """Wrist poses and joints to start from, of hands that were drawn; everything is on one device.
+
+    Each palm approaches until the hand is within the gap or the point is enclosed; what would start under a plane is lifted.
+    """
     q, aim, rotation, gap, back = drawn.joints, drawn.aim, drawn.rotation, drawn.gap, drawn.back
     points = hand.points(q)
     direction = rotation @ hand.palm_direction_wrist

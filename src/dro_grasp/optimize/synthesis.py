@@ -222,15 +222,6 @@ def _optimised(
     return anneal(energy, *start, config, Chances.joined(chances, energy.device))
 
 
-def descend(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig,
-    generator: torch.Generator,
-) -> State:
-    """Run n grasps from where they start, all on the CPU, to the end of the annealing."""
-    chances = Chances.draw(on_device(energy.candidates, "cpu"), len(T), config, generator)
-    return anneal(energy, T.to(energy.device), q.to(energy.device), config, Chances.joined([chances], energy.device))
-
-
 @dataclass(frozen=True)
 class _Annealing(Rows):
     """Grasps on their way, and the mean squared gradient of each coordinate."""
@@ -242,7 +233,7 @@ class _Annealing(Rows):
 def anneal(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig, chances: Chances
 ) -> State:
-    """The same with everything on the energy's device."""
+    """Run n grasps from where they start to the end of the annealing; everything is on the energy's device."""
     left = [1 - step / config.steps for step in range(config.steps)]
     paces = q.new_tensor([config.last_step + (1 - config.last_step) * share for share in left])
     cold, hot = config.last_temperature, config.temperature

@@ -133,31 +133,23 @@ class SettledBest(NamedTuple):
     doubts: tuple[str, ...]  # what closing showed against each, in words of DOUBTS; empty for nothing
 
 
-def settle_best(
-    problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig | None = None,
+def settle_best_all(
+    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], least: int, config: SettleConfig | None = None,
     score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
-) -> SettledBest:
-    """The better share of scored grasps, settled and scored again, in their order.
+) -> list[SettledBest]:
+    """The better share of scored grasps, settled and scored again, in their order; several objects together on a device.
 
     The score counts what closing showed, and on an object seen in part the clearance that the opened hand leaves. A grasp that
     does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most `unstable_score`.
 
     Args:
-        problem: Hand and object; see `can_settle`.
-        grasps: Refined grasps with scores.
+        problems: One hand, and objects; see `can_settle`.
+        batches: Refined grasps of each with scores.
         least: Settle `spare` times as many at least, where there are.
         config: Which grasps settle, and what becomes of their scores.
         score: How grasps are scored.
         admission: What the constraints let pass.
     """
-    return settle_best_all([problem], [grasps], least, config, score, admission)[0]
-
-
-def settle_best_all(
-    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], least: int, config: SettleConfig | None = None,
-    score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
-) -> list[SettledBest]:
-    """The same for several objects of a hand, together on a device."""
     config = config or SettleConfig()
     chosen = [_better_share(*each, least, config) for each in zip(problems, batches, strict=True)]
     some = [grasps[best] for grasps, best in zip(batches, chosen, strict=True)]
@@ -201,8 +193,10 @@ def doubts(
     return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
-def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
-    """Grasps where closing leaves them, and which of them hold still.
+def settle_all(
+    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: SettleConfig | None = None
+) -> list[Settled]:
+    """Grasps where closing leaves them, and which of them hold still; several objects together on a device.
 
     Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
     forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
@@ -211,20 +205,13 @@ def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfi
     is, with several squeezes.
 
     Args:
-        problem: Hand and object; see `can_settle`.
-        grasps: Refined grasps of the two, with or without pregrasp and squeeze.
+        problems: One hand, and objects; see `can_settle`.
+        batches: Refined grasps of each, with or without pregrasp and squeeze.
         config: Limits.
 
     Raises:
         HandError: The hand came without its description.
     """
-    return settle_all([problem], [grasps], config)[0]
-
-
-def settle_all(
-    problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: SettleConfig | None = None
-) -> list[Settled]:
-    """The same for several objects of a hand, together on a device."""
     config = config or SettleConfig()
     whole = [problem.on_table(complete(problem, grasps.without("score"))) for problem, grasps in zip(
         problems, batches, strict=True)]
@@ -324,20 +311,13 @@ def _judged(
     return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable), jammed)
 
 
-def weigh_settled(
-    problem: GraspProblem, grasps: GraspBatch, config: WeighingConfig, settling: SettleConfig
-) -> Float[Tensor, " n"]:
-    """Payloads of settled grasps, weighed in simulation [kg].
-
-    What held the object's mass as it settled carries that at least, and what gave way carries less.
-    """
-    return weigh_settled_all([problem], [grasps], config, settling)[0]
-
-
 def weigh_settled_all(
     problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: WeighingConfig, settling: SettleConfig
 ) -> list[Float[Tensor, " n"]]:
-    """The same for several objects, together where that is quicker."""
+    """Payloads of settled grasps, weighed in simulation [kg]; several objects together where that is quicker.
+
+    What held the object's mass as it settled carries that at least, and what gave way carries less.
+    """
     found: dict[int, Float[Tensor, " n"]] = {}
     for asked, numbers in _alike(problems, settling):
         some = weigh_many(

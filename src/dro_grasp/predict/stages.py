@@ -75,13 +75,8 @@ def refine_all(
         pregrasp_joints=own[2], squeeze_joints=own[3])) for problem, grasps, own in zip(problems, batches, made, strict=True)]
 
 
-def grip(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig) -> GraspBatch:
-    """The same grasps with a pregrasp as the problem asks, and a squeeze that balances the contacts' forces."""
-    return grip_all([problem], [grasps], config)[0]
-
-
 def grip_all(problems: Sequence[GraspProblem], batches: Sequence[GraspBatch], config: RefineConfig) -> list[GraspBatch]:
-    """The same for several objects, together where that is quicker."""
+    """The same grasps with a pregrasp as the problem asks, and a squeeze that balances the contacts' forces."""
     def work(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], most: float) -> Columns:
         return closing_targets(energy, T, q, config.grip)
 

@@ -100,23 +100,18 @@ def press(
     closing is unsound, or loses the object, stays where it is. Arguments and errors are those of `simulate`.
     """
     config = config or WeightConfig()
-    done = pressed(hand, obj, grasps, protocol, config=config, workers=workers, device=device)
+    done = pressed_many(hand, [obj], [grasps], protocol, config=config, workers=workers, device=device)
     return done.grasps.replace(payload=done.payloads(torch.ones(len(grasps), dtype=torch.bool), config.payload))
-
-
-def pressed(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
-) -> Pressed:
-    """As `press`, with payloads only of what they are asked for."""
-    return pressed_many(hand, [obj], [grasps], protocol, config=config, workers=workers, device=device)
 
 
 def pressed_many(
     hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     config: WeightConfig | None = None, workers: int | None = None, device: str = "cpu"
 ) -> Pressed:
-    """The same for several objects, together on a device; their grasps come one batch after the other."""
+    """As `press`, for several objects together on a device, with payloads only of what they are asked for.
+
+    Their grasps come one batch after the other.
+    """
     config, parts, squeezes = config or WeightConfig(), [batches[0][:0]], []
     scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
     for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):

@@ -169,25 +169,17 @@ def _scene_of_trial(scene: TrialScene, trial: int) -> TrialScene:
     return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol, scene.table)
 
 
-def settle(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+def settle_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     workers: int | None = None, device: str = "cpu"
-) -> GraspBatch:
-    """The same grasps, relabelled with the poses of hand and object after closing.
+) -> list[GraspBatch]:
+    """The same grasps, relabelled with the poses of hand and object after closing; several objects together on a device.
 
     A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
     label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
     grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
     outcomes are dropped. Errors are those of `simulate`.
     """
-    return settle_many(hand, [obj], [grasps], protocol, workers=workers, device=device)[0]
-
-
-def settle_many(
-    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    workers: int | None = None, device: str = "cpu"
-) -> list[GraspBatch]:
-    """The same for several objects, together on a device."""
     scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
     joints, poses = [batches[0].joints[:0]], [batches[0].T_object_wrist[:0]]
     for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
@@ -203,7 +195,7 @@ def settle_many(
 def held(
     part: GraspBatch, rollout: Rollout, sound: Bool[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
-    """Labels of closed hands, as of `settle`: joints and wrist poses; those of the grasp where the closing is not sound."""
+    """Labels of closed hands, as of `settle_many`: joints and wrist poses; those of the grasp where the closing is unsound."""
     hand = rollout.scene.hand
     reached, T_object_wrist = _reached(part, rollout, hand, sound)
     touching = contact_mask(hand, [

@@ -50,33 +50,24 @@ class WeighingConfig(Checked):
     """Time for which the object would go on as fast as in the second half of a pull [s]."""
 
 
-def weigh(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+def weigh_many(
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None, device: str = "cpu",
-) -> Float[Tensor, " n"]:
-    """Payloads of grasps that state one, weighed in simulation [kg].
+) -> list[Float[Tensor, " n"]]:
+    """Payloads of grasps that state one, weighed in simulation [kg]; several objects together on a device.
 
     Each hand closes with its squeeze, which is made for the object's mass. Errors are those of `simulate`.
 
     Args:
         hand: The hand of the grasps.
-        obj: Their object.
-        grasps: Grasps with payloads, from which the search begins; NaN stays NaN.
+        objects: Their objects.
+        batches: Grasps of each with payloads, from which the search begins; NaN stays NaN.
         protocol: Physics, and how far the object may move.
         weight: How grasps squeeze for a mass.
         config: How they are weighed.
         workers: Threads; all cores by default.
         device: As of `simulate`.
     """
-    return weigh_many(
-        hand, [obj], [grasps], protocol, weight=weight, config=config, workers=workers, device=device)[0]
-
-
-def weigh_many(
-    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol = DEFAULT_PROTOCOL, *,
-    weight: WeightConfig | None = None, config: WeighingConfig | None = None, workers: int | None = None, device: str = "cpu",
-) -> list[Float[Tensor, " n"]]:
-    """The same for several objects, together on a device."""
     weight, config = weight or WeightConfig(), config or WeighingConfig()
     scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
     found = torch.cat([grasps.payload for grasps in batches])

@@ -25,11 +25,11 @@ from dro_grasp.predict.score.holding import (
     load_holding_score,
     shipped_holding_score,
 )
-from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle_grasps
 
 FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "pierced": 0.0,
         "contacts": 9.0, "links": 5.0, "pressure": 20.0, "slip": 0.5}

@@ -16,8 +16,9 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import scored
-from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle
 from tests.helpers.toy_hand import toy_hand
 
 HAND = toy_hand()
@@ -78,7 +79,7 @@ def test_mesh_and_cloud_agree(grasps):
 
 def test_nearest_contacts_agree_with_a_plain_search(grasps):
     energy = GraspEnergy.of_object(HAND, load_object("sphere"), ScoreConfig().energy)
-    chosen = energy.nearest_contacts(grasps.T_object_wrist, grasps.joints)
+    chosen = energy.nearest_contacts(grasps.T_object_wrist[:, None] @ HAND.tree.forward(grasps.joints))
     candidates = energy.candidates
     for i in range(len(grasps)):
         poses = grasps.T_object_wrist[i] @ HAND.tree.forward(grasps.joints[i])

@@ -29,8 +29,9 @@ from dro_grasp.training.data.engine import labels
 from dro_grasp.training.data.engine.labels import RESTLESS
 from dro_grasp.training.data.engine.schedule import require_settings
 from dro_grasp.training.data.engine.shards import Shard, find_shards
-from dro_grasp.training.data.engine.worker import EngineConfig, Job, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, Job
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import valid_grasps
 
 ROOT = Path(__file__).parents[3]
 

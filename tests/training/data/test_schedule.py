@@ -21,10 +21,11 @@ from dro_grasp.training.data.collections.collection import read_collection
 from dro_grasp.training.data.engine import schedule as engine, worker
 from dro_grasp.training.data.engine.schedule import PairState, next_pairs, synthesize_dataset
 from dro_grasp.training.data.engine.shards import Shard, Yield, find_shards
-from dro_grasp.training.data.engine.worker import EngineConfig, make_shards, shard_seed, valid_grasps
+from dro_grasp.training.data.engine.worker import EngineConfig, make_shards, shard_seed
 from tests.helpers.engine_work import GRASPS
 from tests.helpers.here_pool import HerePool, run
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.one_object import settle, valid_grasps
 
 TINY = EngineConfig(
     "strict", candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
@@ -298,7 +299,6 @@ def test_idle_fingers_of_new_grasps_close():
 
 
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
-    from dro_grasp.simulation.trial import settle
 
     hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(

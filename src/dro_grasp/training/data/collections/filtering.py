@@ -31,7 +31,7 @@ from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import PairGrasps, Sources, yield_notes
 from dro_grasp.training.data.collections.merging import file_name
-from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest, closed_where_it_holds
+from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest, closed_where_they_hold
 from dro_grasp.training.data.engine.pools import LocalPool, attempt
 from dro_grasp.training.data.engine.schedule import COMMAND, REPORT_EVERY, SETTINGS, agree
 from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_shards, notes_of, remove_leftovers, sole_run
@@ -128,17 +128,17 @@ def _passing(
     first, *further = config.protocols
     rows, given, failures = torch.arange(len(grasps)), grasps, Counter[str]()
     if config.resettle:
-        grasps, stable = at_rest(hand, obj, grasps, config.close_fingers)
+        (grasps, stable), = at_rest(hand, [obj], [grasps], config.close_fingers)
         rows, failures = stable.nonzero()[:, 0], Counter({RESTLESS: int((~stable).sum())})
     trial = simulate(hand, obj, grasps[rows], first)
     evaluated = grasps[rows].with_trial(trial)
     if config.close_fingers and not config.resettle:
-        evaluated = closed_where_it_holds(hand, obj, evaluated, first)
+        evaluated, = closed_where_they_hold(hand, [obj], [evaluated], first)
     failures.update(f.value for f, held in zip(trial.failure, evaluated.success.tolist(), strict=True) if f and not held)
     held = evaluated.success
     marked = evaluated[held]
     marked = marked.replace(extra=marked.extra | {ROW: rows[held]})
-    passed, later = also_passing(hand, obj, marked, further)
+    (passed, later), = also_passing(hand, [obj], [marked], further)
     failed = torch.ones(len(given), dtype=torch.bool)
     failed[passed.extra[ROW]] = False
     passed = passed.replace(extra={name: column for name, column in passed.extra.items() if name != ROW})

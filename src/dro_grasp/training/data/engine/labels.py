@@ -31,20 +31,13 @@ SETTLED = "settled"
 
 
 def at_rest(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, close_fingers: bool = False, device: str = "cpu"
-) -> tuple[GraspBatch, Bool[Tensor, " n"]]:
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], close_fingers: bool = False, device: str = "cpu"
+) -> list[tuple[GraspBatch, Bool[Tensor, " n"]]]:
     """Grasps where closing leaves them, with a pregrasp and a squeeze for the object's weight, and which come to rest.
 
     Energies stay those by which a grasp was once chosen; outcomes are dropped. What does not come to rest stays as it is.
-    With `close_fingers`, idle fingers first close onto the object.
+    With `close_fingers`, idle fingers first close onto the object. Several objects close together on a device.
     """
-    return at_rest_of_all(hand, [obj], [grasps], close_fingers, device)[0]
-
-
-def at_rest_of_all(
-    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], close_fingers: bool = False, device: str = "cpu"
-) -> list[tuple[GraspBatch, Bool[Tensor, " n"]]]:
-    """The same for several objects, together on a device."""
     problems, ready = [GraspProblem(hand, obj, device) for obj in objects], list(batches)
     if close_fingers:
         config = EnergyConfig(hand_points=hand.n_points)
@@ -69,22 +62,14 @@ def _rested(grasps: GraspBatch, found: Settled) -> tuple[GraspBatch, Bool[Tensor
 
 
 def also_passing(
-    hand: Hand, obj: ObjectModel, passed: GraspBatch, protocols: Sequence[Protocol], workers: int | None = None,
-    device: str = "cpu",
-) -> tuple[GraspBatch, Counter[str]]:
+    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocols: Sequence[Protocol],
+    workers: int | None = None, device: str = "cpu",
+) -> list[tuple[GraspBatch, Counter[str]]]:
     """Of grasps that passed a first protocol, those that pass further ones too, and how many fail each, by reason.
 
     What was measured stays that of the first trial; the protocols are all named, and `robustness` is that of the one that
     perturbs. Only what has passed one protocol is tried under the next. A device's verdict is not confirmed here.
     """
-    return also_passing_of_all(hand, [obj], [passed], protocols, workers, device)[0]
-
-
-def also_passing_of_all(
-    hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocols: Sequence[Protocol],
-    workers: int | None = None, device: str = "cpu",
-) -> list[tuple[GraspBatch, Counter[str]]]:
-    """The same for several objects, together on a device."""
     kept, failures = list(batches), [Counter[str]() for _ in batches]
     for rules in protocols:
         trials = simulate_many(hand, objects, kept, rules, workers=workers, device=device, confirm=False)
@@ -96,22 +81,14 @@ def also_passing_of_all(
     return list(zip(kept, failures, strict=True))
 
 
-def closed_where_it_holds(
-    hand: Hand, obj: ObjectModel, evaluated: GraspBatch, protocol: str | Protocol,
-    min_links: int = FEWEST_LINKS, workers: int | None = None, device: str = "cpu",
-) -> GraspBatch:
-    """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
-
-    Column `relabelled` marks them. A device's verdict is not confirmed here. Energies stay those by which grasps were chosen.
-    """
-    return closed_where_they_hold(hand, [obj], [evaluated], protocol, min_links, workers, device)[0]
-
-
 def closed_where_they_hold(
     hand: Hand, objects: Sequence[ObjectModel], batches: Sequence[GraspBatch], protocol: str | Protocol,
     min_links: int = FEWEST_LINKS, workers: int | None = None, device: str = "cpu",
 ) -> list[GraspBatch]:
-    """The same for several objects, together on a device."""
+    """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
+
+    Column `relabelled` marks them. A device's verdict is not confirmed here. Energies stay those by which grasps were chosen.
+    """
     rows, closed = [], []
     for obj, evaluated in zip(objects, batches, strict=True):
         energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points), device=device)

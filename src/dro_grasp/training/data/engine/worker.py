@@ -34,7 +34,7 @@ from dro_grasp.simulation.outcome import FEWEST_LINKS
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import hand_shift, settle_many, simulate_many
 from dro_grasp.training.data.bundle.training_file import split_of
-from dro_grasp.training.data.engine.labels import RESTLESS, also_passing_of_all, at_rest_of_all, closed_where_they_hold
+from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest, closed_where_they_hold
 from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, failure_of, notes_of
 
 ON_DEVICE = {"candidates": 512, "min_candidates": 256, "max_candidates": 1024, "candidate_budget": 65536, "together": 8}
@@ -201,16 +201,11 @@ class Wanted(NamedTuple):
     earlier: GraspBatch | None = None  # A grasp close to one of these is a duplicate
 
 
-def valid_grasps(
-    hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig, candidates: int | None = None,
-    earlier: GraspBatch | None = None,
-) -> tuple[GraspBatch, Yield]:
-    """Candidates of one seed that pass the protocol, best energy first, without near-duplicates of them and of earlier ones."""
-    return valid_grasps_of_all(hand, [Wanted(obj, seed, candidates or config.candidates, earlier)], config)[0]
-
-
 def valid_grasps_of_all(hand: Hand, wanted: Sequence[Wanted], config: EngineConfig) -> list[tuple[GraspBatch, Yield]]:
-    """The same for several objects, together where a device makes the candidates."""
+    """Candidates that pass the protocol, best energy first, without near-duplicates of them and of earlier ones.
+
+    Several objects are computed together where a device makes the candidates.
+    """
     objects, (batches, made) = [one.obj for one in wanted], _drawn(hand, wanted, config)
     if config.settle and not config.resettle:
         batches, made = _closed(hand, objects, batches, made, config)
@@ -260,7 +255,7 @@ def _passing(
     device = config.synthesis.device
     if not config.resettle:
         return _tried(hand, objects, batches, config, device, config.close_fingers)
-    rested = at_rest_of_all(hand, objects, batches, config.close_fingers, device)
+    rested = at_rest(hand, objects, batches, config.close_fingers, device)
     tried = _tried(hand, objects, [grasps[stable] for grasps, stable in rested], config, device)
     return [(passed, failures + Counter({RESTLESS: int((~stable).sum())}))
             for (passed, failures), (_, stable) in zip(tried, rested, strict=True)]
@@ -281,7 +276,7 @@ def _tried(
     if close_fingers:
         passed = closed_where_they_hold(
             hand, objects, passed, config.protocol, config.min_contact_links, config.threads, device)
-    later = also_passing_of_all(hand, objects, passed, [protocol(name) for name in config.also], config.threads, device)
+    later = also_passing(hand, objects, passed, [protocol(name) for name in config.also], config.threads, device)
     return [(kept, first + more) for first, (kept, more) in zip(failures, later, strict=True)]
 
 
