@@ -1,4 +1,4 @@
-"""Groups of points that stand apart from one another, as several things in a cloud do."""
+"""Points and their neighbours: groups that stand apart from one another, as several things in a cloud do, and normals."""
 
 from __future__ import annotations
 
@@ -38,3 +38,12 @@ def _spacing(points: Float[np.ndarray, "n 3"]) -> float:
     thin = points[one_per_cell(points, CELL / 4)]
     some = thin[:: max(1, len(thin) // 2000)]
     return float(np.quantile(KDTree(thin).query(some, k=min(3, len(thin)))[0].reshape(len(some), -1)[:, -1], 0.9))
+
+
+def local_normals(points: Float[np.ndarray, "n 3"], neighbours: int) -> Float[np.ndarray, "n 3"]:
+    """Unit normals of a cloud, to no side: the direction in which the neighbours of each point spread least."""
+    if len(points) < 3:
+        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    near = points[KDTree(points).query(points, k=min(neighbours, len(points)))[1]]
+    local = near - near.mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]

@@ -15,6 +15,7 @@ from dro_grasp.files import given_path
 from dro_grasp.geometry.cache import content_hash
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.geometry.point_clouds import distinct_points, enclosed_volume
+from dro_grasp.geometry.point_groups import local_normals
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.convex_parts import OPEN_FILL, Part
 from dro_grasp.objects.perception.things import AS_SCENE, one_thing, refuse_scene
@@ -211,9 +212,7 @@ def estimate_normals(
     points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "n 3"]:
     """Unit normals of a cloud by local principal axes, turned to the camera, or away from the cloud's mean without one."""
-    neighbours = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1]
-    local = points[neighbours] - points[neighbours].mean(1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+    normals = local_normals(points, NEIGHBOURS)
     towards = points - points.mean(0) if camera is None else camera - points
     outward = (towards * normals).sum(1) >= 0
     return np.where(outward[:, None], normals, -normals).astype(np.float32)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dro_grasp.apps.viewer.scene_cloud import colours_of, first_hit, normals_of, shades
+from dro_grasp.apps.viewer.scene_cloud import colours_of, first_hit, shades
 from dro_grasp.apps.viewer.scene_view import rgb
+from dro_grasp.geometry.point_groups import local_normals
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR
 from dro_grasp.objects.perception.segmentation import NOTHING, OTHER, STRUCTURE
 from dro_grasp.objects.scenery import load_scene
@@ -58,11 +59,11 @@ def test_colours_say_what_points_were_taken_for() -> None:
 def test_surfaces_are_lit_from_above_and_normals_are_those_of_a_ball() -> None:
     ball = np.random.default_rng(0).normal(size=(4000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    assert np.median(np.abs((normals_of(ball) * ball).sum(1))) > 0.99
+    assert np.median(np.abs((local_normals(ball, 24) * ball).sum(1))) > 0.99
     light = shades(np.array([[0.0, 0, 1], [0, 0, -1], [0, 1, 0]]), np.array([0.0, 0, 2]))
     assert light[0] == light[1] == 1.0
     assert light[2] < 0.8
-    assert normals_of(ball[:3]).shape == (3, 3)
+    assert local_normals(ball[:3], 24).shape == (3, 3)
 
 
 def test_a_place_on_a_thing_means_it_alone() -> None:

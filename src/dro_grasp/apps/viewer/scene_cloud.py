@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from dro_grasp.apps.viewer.scene_view import Client, rgb
 from dro_grasp.geometry.point_clouds import one_per_cell
+from dro_grasp.geometry.point_groups import local_normals
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.objects.perception.choosing import Chosen
 from dro_grasp.objects.perception.segmentation import STRUCTURE
@@ -51,7 +52,7 @@ class SceneCloud:
         self.up = upward(scene)
         self.point = point_size(self.world[self._rows])
         self._shade = np.ones(len(self.world))
-        self._shade[self._rows] = shades(normals_of(self.world[self._rows]), np.asarray(self.up))
+        self._shade[self._rows] = shades(local_normals(self.world[self._rows], NEIGHBOURS), np.asarray(self.up))
         client.scene.set_up_direction(self.up)
         client.scene.remove_by_name("/scene")
         self._points: list[viser.PointCloudHandle] = []
@@ -132,15 +133,6 @@ def point_size(points: Float[np.ndarray, "n 3"]) -> float:
     some = points[:: max(1, len(points) // 2000)]
     apart = float(np.median(KDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
     return min(max(POINT, 1.3 * apart), LARGEST_POINT)
-
-
-def normals_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit normals of a cloud, to no side: the direction in which the neighbours of each point spread least."""
-    if len(points) < NEIGHBOURS:
-        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    near = points[KDTree(points).query(points, k=NEIGHBOURS)[1]]
-    local = near - near.mean(1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
 
 
 def shades(normals: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
+from dro_grasp.geometry.point_groups import local_normals
 from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
 from dro_grasp.objects.perception.seams import Surface, joined, parted
 
@@ -115,7 +116,7 @@ class _View:
             kept = away < max(REACH, 2 * float(np.quantile(away, 0.02)))
         cells, own, edge = _averaged(points[kept], edge)
         cell_of[kept] = own
-        normals = _normals(cells)
+        normals = local_normals(cells, NEIGHBOURS)
         if camera is not None:
             normals = normals * np.where(((camera - cells) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
         return cls(cells, normals, edge, camera, cell_of, points)
@@ -144,14 +145,6 @@ def _averaged(points: Float[np.ndarray, "n 3"], edge: float) -> tuple[Float[np.n
         edge *= max(1.1, (count / MOST_CELLS) ** 0.5)
     number = np.bincount(own, minlength=count)
     return np.stack([np.bincount(own, points[:, k], count) / number for k in range(3)], 1), own, edge
-
-
-def _normals(cells: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    if len(cells) < 3:
-        return np.tile([0.0, 0.0, 1.0], (len(cells), 1))
-    near = KDTree(cells).query(cells, k=min(NEIGHBOURS, len(cells)))[1]
-    local = cells[near] - cells[near].mean(1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
 
 
 @dataclass(frozen=True, eq=False)
