@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from dro_grasp.cli.given_scene import check_choice, find_thing
+from dro_grasp.cli.given_scene import SceneOptions, check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside, say_file
 from dro_grasp.cli.remote import generate_at, server_of
@@ -46,19 +46,9 @@ class Generate:
     hand: str  # A hand's name (see `dro-grasp hands`) or the path of its URDF or MJCF file.
     object: Annotated[str | None, optional("NAME|PATH", "none, with --scene")] = None
     """An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them."""
-    scene: Annotated[Path | None, optional("CLOUD|DEPTH", "an object alone")] = None
-    """Instead of --object: what a camera saw, a cloud or a depth image (PNG, TIFF, NPY). One thing in it is the object, the
-    plane on which it stands its table, all else obstacles."""
     at: Annotated[tuple[float, float, float] | None, optional("X Y Z", "the only thing")] = None
     """Which thing of the scene: the one at this place [m], in the frame of the grasps."""
-    pixel: Annotated[tuple[float, float] | None, optional("U V", "the only thing")] = None
-    """Which thing of the scene: the one that this pixel shows, by column and row."""
-    mask: Annotated[Path | None, optional("PNG", "the only thing")] = None
-    """Which thing of the scene: the pixels that are not black in this image."""
-    nearest: Flag = False  # Which thing of the scene: the one nearest to the camera.
-    part: Flag = False  # Of things that touch: the one side at --at or --pixel.
-    scene_picture: Annotated[Path | None, optional("PNG", "no picture")] = None
-    """Picture of what was taken for the object, for tables and walls, and for obstacles, before anything is grasped."""
+    seen: SceneOptions = field(default_factory=SceneOptions)
     num: int = 16  # How many grasps of each object.
     candidates: int = 4  # Most candidates for each grasp; the best by score are kept. 1 is quickest.
     seed: int = 0  # The same seed gives the same grasps.
@@ -153,14 +143,14 @@ class Generate:
         constraints = self.constraints.constraints(self.table)
         if self.touch_table is not None:
             constraints = replace(constraints, touch_table=self.touch_table == "yes")
-        names = [self._source] if self.scene is not None else resolve_objects([self._source])
+        names = [self._source] if self.seen.scene is not None else resolve_objects([self._source])
         several = names != [self._source]
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         found = None
-        if self.scene is not None:
-            found = find_thing(load_scene(self.scene, scale=self.scale, camera=self.camera), self)
+        if self.seen.scene is not None:
+            found = find_thing(load_scene(self.seen.scene, scale=self.scale, camera=self.camera), self)
             constraints = replace(constraints, obstacles=found.obstacles)
         if self.obstacles is not None:
             scene = load_scene(self.obstacles, scale=self.scale)
@@ -176,20 +166,21 @@ class Generate:
     @property
     def _source(self) -> str:
         """What grasps are made of: the object, or the scene in which it is."""
-        return str(self.scene) if self.object is None else self.object
+        return str(self.seen.scene) if self.object is None else self.object
 
     def check_scene(self) -> None:
         """Refuse options that contradict one another or the kind of object, by an OptionError."""
         check_choice(self)
-        if self.scene is not None and self.keep_table:
+        of_scene = self.seen.scene is not None
+        if of_scene and self.keep_table:
             raise OptionError("--keep-table keeps a table that is in an object's own cloud; leave it out: the table of a scene "
                               "is found in any case, and hands stay above it")
-        what = "a thing of a scene" if self.scene is not None else "what a camera sees" if self.camera is not None else None
+        what = "a thing of a scene" if of_scene else "what a camera sees" if self.camera is not None else None
         tried = self.protocol not in {None, "none"}
         asked = [f"--protocol {self.protocol}"] * tried + ["--only-successful"] * self.only_successful
         if what is not None and asked:
             options, verb = " and ".join(asked), "asks" if len(asked) == 1 else "ask"
-            seen = " and ".join(["--scene"] * (self.scene is not None) + ["--camera"] * (self.camera is not None))
+            seen = " and ".join(["--scene"] * of_scene + ["--camera"] * (self.camera is not None))
             raise OptionError(f"{options} {verb} for a trial in simulation, and {what} is a bare point cloud, which gets none; "
                               f"leave out {options}, or give the object's mesh with --object and leave out {seen}")
         if self.only_successful and self.protocol == "none":

@@ -66,8 +66,9 @@ def generate_at(address: str, command: Generate) -> int:
 
 def require_possible(command: Generate) -> None:
     """Refuse what a server cannot do: OptionError."""
-    defaults = {field.name: field.default for field in fields(command)}
-    given = [name for name in (*OWN, *SHOWN, *SCENE) if getattr(command, name) != defaults[name]]
+    defaults = {field.name: field.default for field in (*fields(command), *fields(command.seen))}
+    values = vars(command) | vars(command.seen)
+    given = [name for name in (*OWN, *SHOWN, *SCENE) if values[name] != defaults[name]]
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         why = ("weights and device are those that the server was started with" if given[0] in OWN

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.given_scene import check_choice, find_on_table
+from dro_grasp.cli.given_scene import SceneOptions, check_choice, find_on_table, seen_from
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, load_obstacle, optional
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside, say_file
 from dro_grasp.errors import OptionError
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from dro_grasp.arm.robots.robot import Robot
     from dro_grasp.arm.tabletop.attempts import Attempt
     from dro_grasp.arm.tabletop.table_scene import PickedObject
-    from dro_grasp.objects.perception.scene_files import SceneCamera
 
 
 FLOATS = 0.1
@@ -44,9 +43,6 @@ class Plan:
     object: Annotated[str | None, optional("NAME|PATH", "none, with --scene")] = None
     """An object's name (see `dro-grasp objects`), a mesh, or a cloud (PLY, NPY, PCD), in the robot's world frame. A cloud may
     also show the table."""
-    scene: Annotated[Path | None, optional("CLOUD|DEPTH", "an object alone")] = None
-    """Instead of --object: what a camera saw, a cloud or a depth image (PNG, TIFF, NPY). One thing in it is the object, the
-    plane on which it stands the table, and nothing touches all else that is over the table."""
     camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
     """File with {"frame": "world", "T_frame_camera": 4x4}, or `robot` for the camera of the robot file. Object or scene are
     then in the camera's frame, and the unseen side is completed. For depth images, with "intrinsics": 3x3."""
@@ -55,14 +51,7 @@ class Plan:
     at: Annotated[tuple[float, ...] | None, optional("X Y [Z]", "as --pose says, or the only thing")] = None
     """X Y: put the object on the table at this place [m], upright as in its own frame. X Y Z: which thing of the scene, the one
     at this place in the world [m]."""
-    pixel: Annotated[tuple[float, float] | None, optional("U V", "the only thing")] = None
-    """Which thing of the scene: the one that this pixel shows, by column and row."""
-    mask: Annotated[Path | None, optional("PNG", "the only thing")] = None
-    """Which thing of the scene: the pixels that are not black in this image."""
-    nearest: Flag = False  # Which thing of the scene: the one nearest to the camera.
-    part: Flag = False  # Of things that touch: the one side at --at or --pixel.
-    scene_picture: Annotated[Path | None, optional("PNG", "no picture")] = None
-    """Picture of what was taken for the object, for tables and walls, and for obstacles, before anything is grasped."""
+    seen: SceneOptions = field(default_factory=SceneOptions)
     obstacles: tuple[str, ...] = ()  # Clouds and meshes of things, in the world frame, that nothing may touch.
     surroundings: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, without object and robot, of any size, in the world frame. Hand and arm stay clear
@@ -184,14 +173,14 @@ class Plan:
         """Refuse options that contradict one another, by an OptionError."""
         check_choice(self, own=("--at",))
         if self.at is not None:
-            wanted, such = (("x and y", "0.5 0.1"), ("x, y and z", "0.5 0.1 0.05"))[self.scene is not None]
-            if len(self.at) != 2 + (self.scene is not None) or not all(map(math.isfinite, self.at)):
+            wanted, such = (("x and y", "0.5 0.1"), ("x, y and z", "0.5 0.1 0.05"))[self.seen.scene is not None]
+            if len(self.at) != 2 + (self.seen.scene is not None) or not all(map(math.isfinite, self.at)):
                 raise OptionError(f"--at is {' '.join(f'{value:g}' for value in self.at)}; give {wanted} in metres, such as "
-                                  f"--at {such}, of {'the scene' if self.scene is not None else 'the object'}")
-        if self.scene is not None and self.pose is not None:
+                                  f"--at {such}, of {'the scene' if self.seen.scene is not None else 'the object'}")
+        if self.seen.scene is not None and self.pose is not None:
             raise OptionError("--pose says where an object stands that is given alone; leave it out: a scene is in the world's "
                               "or a camera's frame")
-        if self.scene is None and sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
+        if self.seen.scene is None and sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
             raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
 
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
@@ -205,9 +194,9 @@ class Plan:
         from dro_grasp.objects.perception.scan import load_scan
         from dro_grasp.objects.scenery import load_scene
 
-        T, camera = np.eye(4), self._camera(robot)
-        if self.scene is not None:
-            return find_on_table(seen_on_table(load_scene(self.scene, camera=camera), robot), robot, self), T
+        T, camera = np.eye(4), seen_from(self.camera, robot)
+        if self.seen.scene is not None:
+            return find_on_table(seen_on_table(load_scene(self.seen.scene, camera=camera), robot), robot, self), T
         assert self.object is not None
         if camera is not None:
             obj = load_scan(given_path(self.object), camera.T_frame_camera)
@@ -224,18 +213,6 @@ class Plan:
         elif obj.table is not None and robot.table is not None:  # it was cut off the cloud
             return PickedObject(obj, [], at_seen_height(robot, obj)).noted(robot), T
         return PickedObject(obj, [], robot), T
-
-    def _camera(self, robot: Robot) -> SceneCamera | None:
-        """The camera in the world; None if the object is in the world's frame."""
-        from dro_grasp.objects.perception.scene_files import as_camera
-
-        if self.camera is None:
-            return None
-        if self.camera != "robot":
-            return as_camera(self.camera)
-        if robot.camera is None:
-            raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
-        return robot.camera.as_seen()
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from dro_grasp.cli.given_scene import ROBOT, seen_from
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import say_file
 from dro_grasp.errors import GraspFileError, OptionError
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
     from dro_grasp.apps.viewer.scene_view import Client, Page, ServedPage
     from dro_grasp.apps.viewer.studio import Studio
     from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.objects.perception.scene_files import SceneCamera
     from dro_grasp.objects.shape import ObjectModel
 
-ROBOT = "robot"  # What --camera says for the camera of the robot file
 MAX_SIDE = 4096  # Largest width and height of one picture [pixels]
 MAX_PIXELS = 50_000_000  # Most pixels of all pictures on a sheet together
 
@@ -116,7 +117,6 @@ class View:
     def _of_scene(self, file: Path) -> Callable[[Client, Lock], Page]:
         """What makes the page of a scene, which is read and taken apart once for all browsers."""
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.perception.scene_files import SceneCamera
         from dro_grasp.objects.scenery import load_scene
         from dro_grasp.predict.predictor import GraspPredictor
 
@@ -133,10 +133,7 @@ class View:
             from dro_grasp.arm.robots.loading import load_robot
 
             robot = load_robot(self.robot)
-            if camera == ROBOT:
-                if robot.camera is None:
-                    raise OptionError(f"robot '{robot.name}' states no camera; give --camera JSON, or state it in its file")
-                camera = SceneCamera(robot.camera.T_world_camera, robot.camera.intrinsics, "world")
+            camera = seen_from(self.camera, robot)
             scene = load_scene(file, scale=self.scale, camera=camera)
             made = partial(RobotScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, robot=robot)
         _ = scene.segments  # refused before a browser comes

@@ -26,7 +26,7 @@ from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot, Table
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt, carry_out
-from dro_grasp.cli.given_scene import find_on_table
+from dro_grasp.cli.given_scene import SceneOptions, find_on_table
 from dro_grasp.cli.robots import Plan
 from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.hands.hand import Hand
@@ -140,7 +140,7 @@ def test_what_is_seen_flat(narrow: Robot, tmp_path: Path) -> None:
     assert picked.robot.table is not None
     assert picked.robot.table.height == pytest.approx(TABLE.height, abs=3e-4)
     assert picked.robot.table.size == narrow.table.size  # type: ignore[union-attr]
-    choice = Plan("xarm7_leaphand", scene=Path("scene"), mask=tmp_path / "m.png", scene_picture=tmp_path / "s.png")
+    choice = Plan("xarm7_leaphand", seen=SceneOptions(Path("scene"), mask=tmp_path / "m.png", scene_picture=tmp_path / "s.png"))
     Image.fromarray(255 * of_card[None].astype(np.uint8)).save(tmp_path / "m.png")
     again = find_on_table(scene, narrow, choice)
     assert np.allclose(again.obj.centre_of_mass, found.obj.centre_of_mass, atol=1e-4)
