@@ -7,11 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.apps.viewer.scene_view import Client, move, rgb
+from dro_grasp.apps.viewer.scene_view import Client, add_hand, beside_ray, move, rgb
 from dro_grasp.geometry.rendering.rasterizer import Colour
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.pictures import appearance
 
 BALL = 0.007  # Radius of the ball that marks a grasp's wrist [m]
 RATED = np.array([(0.82, 0.28, 0.24), (0.95, 0.77, 0.25), (0.20, 0.66, 0.36)])
@@ -27,10 +26,7 @@ class HandView:
         scene, self.hand, self._client = client.scene, hand, client
         scene.remove_by_name("/hand")
         self._root = scene.add_frame("/hand", show_axes=False, visible=False)
-        colours = appearance.link_colours(hand)
-        self._links = [scene.add_frame(f"/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
-        for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
-            scene.add_mesh_simple(f"/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
+        self._links = add_hand(scene, "/hand", hand)
 
     def pose(self, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
         """Show the hand with these joints [rad or m] and this pose of the wrist [m]."""
@@ -75,9 +71,7 @@ class GraspMarks:
 
     def hit(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> int | None:
         """The grasp whose ball a ray meets first; None for none."""
-        away = self.wrists - origin
-        depth = away @ (direction / np.linalg.norm(direction))
-        aside = np.sqrt(np.maximum((away**2).sum(1) - depth**2, 0.0))
+        depth, aside = beside_ray(self.wrists, origin, direction)
         met = np.flatnonzero((depth > 0) & (aside < 1.5 * BALL))
         return int(met[depth[met].argmin()]) if len(met) else None
 

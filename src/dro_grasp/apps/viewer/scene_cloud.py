@@ -9,7 +9,7 @@ import viser
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from dro_grasp.apps.viewer.scene_view import Client, rgb
+from dro_grasp.apps.viewer.scene_view import Client, beside_ray, rgb
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.point_groups import local_normals
 from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
@@ -158,12 +158,9 @@ def first_hit(
 
     Points are no surface: of those that are met at about the same depth, the one nearest to the ray is taken.
     """
-    length = float(np.linalg.norm(direction))
-    if not len(points) or not np.isfinite([*origin, *direction]).all() or length == 0:
+    if not len(points) or not np.isfinite([*origin, *direction]).all() or not np.linalg.norm(direction):
         return None
-    away = points - np.asarray(origin)
-    depth = away @ (np.asarray(direction) / length)
-    aside = np.sqrt(np.maximum((away**2).sum(1) - depth**2, 0.0))
+    depth, aside = beside_ray(points, origin, direction)
     met = np.flatnonzero((depth > 0) & (aside < cone * depth))
     if not len(met):
         return None

@@ -38,7 +38,6 @@ NO_THING = "none"  # Choice of no thing
 NO_GRASP = "none yet"  # Choice of no grasp
 USUAL = 12  # Grasps that are asked for at first (ours)
 MOST = 32  # Most grasps of one thing (ours)
-TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still wanted [s] (ours)
 AROUND = 0.06  # Margin of a thing in the view of its grasps [m] (ours)
 LISTED = 6  # Grasps in the table (ours)
 UPRIGHT = 0.999  # Cosine of the scene's upward direction to z below which browsers have to turn the world first (ours)
@@ -300,10 +299,7 @@ class ScenePage(Page):
     def _made(self, wish: Wish) -> Offer:
         """Take the thing out of the scene, and make its grasps when it is this page's turn."""
         name = f"thing {wish.number + 1}"
-        while not self._turn.acquire(timeout=TURN_POLL):
-            self._still(wish)
-            self._say("Grasps of another page are made; these are next.")
-        try:
+        with self._when_it_is(self._turn, lambda: self._still(wish)):
             begin = time.perf_counter()
             self._say(f"**Thing {wish.number + 1}**: its unseen side is estimated ...")
             place = wish.cloud.scene.spot(wish.number) if wish.side is None else wish.side
@@ -315,8 +311,6 @@ class ScenePage(Page):
             offer = self._offered(wish, found)
             self._seconds = time.perf_counter() - begin
             return offer
-        finally:
-            self._turn.release()
 
     def _notes(self, wish: Wish, found: FoundObject) -> str:
         """What was taken, and what is uncertain about it, in Markdown."""

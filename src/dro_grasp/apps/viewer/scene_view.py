@@ -47,6 +47,7 @@ NARROW = 1.0  # Width over height of a window below which the panel covers its l
 RAISED = 0.27  # Share of its height by which hand and object then stand above the middle (ours)
 PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does [s] (ours)
+TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still wanted [s] (ours)
 GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 
 Point = tuple[float, float, float]  # A place [m]
@@ -82,10 +83,7 @@ class SceneView:
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
         for i, mesh in enumerate(appearance.object_meshes(obj)):
             scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=rgb(OBJECT_COLOUR), side="double")
-        colours = appearance.link_colours(hand)
-        self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
-        for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
-            scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
+        self.links = add_hand(scene, f"{name}/hand", hand)
         self.solved = self._cloud("solved", appearance.SOLVED_COLOUR)
         self.predicted = self._cloud("predicted", appearance.PREDICTED_COLOUR)
         self.contacts = self._cloud("contacts", appearance.CONTACT_COLOUR, size=0.005)
@@ -141,6 +139,24 @@ class SceneView:
         with self.client.atomic():
             for frame in self.links:
                 frame.visible = visible
+
+
+def add_hand(scene: viser.SceneApi, name: str, hand: Hand) -> list[viser.FrameHandle]:
+    """Add the shapes of a hand to the scene; returns the frames of its links."""
+    colours = appearance.link_colours(hand)
+    links = [scene.add_frame(f"{name}/{i}", show_axes=False) for i in range(hand.tree.n_links)]
+    for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
+        scene.add_mesh_simple(f"{name}/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
+    return links
+
+
+def beside_ray(
+    points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """How far points are along a ray, and how far beside it [m]."""
+    away = points - origin
+    depth = away @ (direction / np.linalg.norm(direction))
+    return depth, np.sqrt(np.maximum((away**2).sum(1) - depth**2, 0.0))
 
 
 def move(handle: viser.SceneNodeHandle, T: Float[np.ndarray, "4 4"]) -> None:
@@ -312,6 +328,17 @@ class Page(ABC):
                 self._complain(error)
             finally:
                 self._busy.release()
+
+    @contextlib.contextmanager
+    def _when_it_is(self, turn: threading.Lock, still: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """Wait for the turn of this page to make grasps; `still` raises where they are no longer wanted meanwhile."""
+        while not turn.acquire(timeout=TURN_POLL):
+            still()
+            self._say("Grasps of another page are made; these are next.")
+        try:
+            yield
+        finally:
+            turn.release()
 
     def _complain(self, error: DroGraspError) -> None:
         self._say(f"**Error:** {escaped(error)}")

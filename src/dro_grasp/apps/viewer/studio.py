@@ -37,7 +37,6 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 MAX_GRASPS = 64  # Most grasps of one click (ours)
 MAX_CANDIDATES = 8  # Most candidates for each of them (ours)
-TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still open [s] (ours)
 
 
 class Studio(GraspPage):
@@ -231,14 +230,10 @@ class Studio(GraspPage):
 
     def _generate(self) -> None:
         """Make grasps as the controls say, when it is this page's turn."""
-        while not self._turn.acquire(timeout=TURN_POLL):
-            self._say("Grasps of another page are made; these are next.")
-        try:
+        with self._when_it_is(self._turn):
             self._say("Generating ...")
             begin = time.perf_counter()
             made = self._generated()
-        finally:
-            self._turn.release()
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{escaped(made.protocol)}*")
         remarks = [] if made.shortage is None else [made.shortage]
