@@ -31,7 +31,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import simulate
-from lab.benchmarks.report import emit, rate
+from lab.benchmarks.report import emit, options_of, rate
 
 CHANGES = {
     "1 ms": {"timestep": 0.001},
@@ -79,14 +79,13 @@ def row(name: str, setting: str, usual: Bool[Tensor, " n"], found: Bool[Tensor, 
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hands", nargs="+", default=list(HANDS))
     parser.add_argument("--objects", nargs="+", default=["assets:validate"])
     parser.add_argument("--num", type=int, default=8, help="grasps of each hand on each object")
     parser.add_argument("--protocols", nargs="+", default=["carry", "strict"])
     parser.add_argument("--seed", type=int, default=0, help="of the grasps")
     parser.add_argument("--workers", type=int, default=cores(), help="threads of the trials")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     found = list(outcomes(options))
     joined = {key: torch.cat([pair[key] for pair in found]) for key in found[0]}

@@ -8,7 +8,6 @@ knows its convex parts and distances.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import statistics
 import subprocess
@@ -20,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 BUILT_IN = ("generate", "--hand", "allegro", "--object", "rubber_duck", "--output", "grasps.parquet")
 NEW = ("generate", "--hand", "allegro", "--object", "new.stl", "--num", "16", "--output", "grasps.parquet")
@@ -59,9 +58,8 @@ def seconds(arguments: tuple[str, ...], folder: Path) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--runs", type=int, default=3, help="counted runs of each command")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     rows, found, seed = [], {}, time.time_ns()
     with tempfile.TemporaryDirectory() as name:

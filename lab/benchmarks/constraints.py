@@ -11,7 +11,6 @@ was asked for [mm]; of a place to hold, the number of fingers within 1 cm of its
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
@@ -33,7 +32,7 @@ from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 ABOVE = (0.0, 0.0, -1.0)
 """Palm direction from above."""
@@ -121,12 +120,11 @@ def cases_of(obj: ObjectModel) -> dict[str, Case]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--objects", nargs="+", default=["mug", "spray_bottle", "hammer"])
     parser.add_argument("--num", type=int, default=8, help="grasps that are asked for")
     parser.add_argument("--cases", nargs="+", help="all by default")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     predictor, hand, rows = GraspPredictor(), load_hand(options.hand), []
     objects = [load_object(name) for name in options.objects]

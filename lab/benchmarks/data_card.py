@@ -9,7 +9,6 @@ the pairs that are done, before and after.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections import Counter
 from dataclasses import replace
@@ -22,7 +21,7 @@ from dro_grasp.training.data.collections.coverage import HandCoverage, measure_c
 from dro_grasp.training.data.collections.filtering import read_kept
 from dro_grasp.training.data.collections.report import charts, grasps_drawn
 from dro_grasp.training.data.engine.shards import Yield, find_shards
-from lab.benchmarks.report import ROOT, emit, rate
+from lab.benchmarks.report import ROOT, emit, options_of, rate
 
 PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
@@ -84,11 +83,10 @@ def _measured(hand: HandCoverage) -> list[str]:
 
 def main() -> None:
     """Print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "grasps", help="merged files")
     parser.add_argument("--labels", type=Path, help="tell what a filter keeps of them in this folder")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of one hand")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     folder = options.folder
     if options.pictures is not None:

@@ -8,7 +8,6 @@ this new process: unchanged, with lower and higher friction, and with a lighter 
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
@@ -19,7 +18,7 @@ from dro_grasp.training.data.collections.checking import check
 from dro_grasp.training.data.collections.collection import PairGrasps, read_collection
 from dro_grasp.training.data.collections.coverage import measure_coverage
 from dro_grasp.training.data.engine.shards import Yield
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 from lab.benchmarks.synthesis import HANDS, training_objects
 
 TRIALS = (
@@ -54,11 +53,10 @@ def again(pairs: list[PairGrasps], sample: int) -> list[list[object]]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path, help="a data set with the paper hands")
     parser.add_argument("--sample", type=int, default=500, help="grasps to evaluate again, of all hands")
     parser.add_argument("--goal", type=int, default=150, help="grasps of a complete pair")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     pairs = list(read_collection(options.folder))

@@ -35,7 +35,7 @@ from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import problems_of
 from dro_grasp.training.data.engine.worker import EngineConfig, Wanted, valid_grasps_of_all
-from lab.benchmarks.report import emit, note
+from lab.benchmarks.report import emit, note, options_of
 
 HAND, OBJECT = "allegro", "rubber_duck"
 REPETITIONS = 5
@@ -173,14 +173,13 @@ def kind(device: str) -> str:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor")
     parser.add_argument("--only", default="prediction,synthesis,shards", help="what is measured, by commas")
     parser.add_argument("--settled", action="store_true", help="predictions with settling alone")
     parser.add_argument("--alone", action="store_true", help="leave out the processor")
     parser.add_argument("--quick", action="store_true", help="one repetition")
     parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     require_device(options.device)
     repetitions, only = 1 if options.quick else REPETITIONS, options.only.split(",")

@@ -43,7 +43,7 @@ from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import TrialResult, simulate
 from lab.benchmarks.agreement import kappa
-from lab.benchmarks.report import emit, note, rate
+from lab.benchmarks.report import emit, note, options_of, rate
 from lab.measurements import STORED
 
 DIFFERENT = 64
@@ -195,7 +195,7 @@ def settled(problem: GraspProblem, grasps: GraspBatch) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--device", default="cuda", help="what is compared with the processor; warp: its own")
     parser.add_argument("--grasps", nargs="*", type=Path, default=list(STORED), help="files of stored grasps")
     parser.add_argument("--num", type=int, default=400, help="grasps of each file")
@@ -206,7 +206,6 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--object", default="rubber_duck")
     parser.add_argument("--pack", type=Path, help="copy the assets that the stored grasps need there, and measure nothing")
     parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     if options.pack:
         return pack(options.grasps, options.num, options.pack)

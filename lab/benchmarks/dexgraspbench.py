@@ -30,7 +30,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.contacts import NAMES, with_contacts
 from dro_grasp.training.data.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
-from lab.benchmarks.report import emit, rate
+from lab.benchmarks.report import emit, options_of, rate
 
 PALM = 0.034
 """Height of the palm in the frame of the official postures, along z [m]. Source: the benchmark's description of the hand."""
@@ -44,13 +44,12 @@ OFFICIAL, OURS = "official grasps", "ours"
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path, help="clone of DexGraspBench")
     parser.add_argument("--hand", help="hand of the official grasps; without it they are left out")
     parser.add_argument("--own", help="hand of our grasps; without it they are left out")
     parser.add_argument("--num", type=int, default=20, help="our grasps on each object at each scale")
     parser.add_argument("--work", type=Path, help="folder for measured pairs")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     measured = {}

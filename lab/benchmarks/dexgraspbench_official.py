@@ -31,7 +31,7 @@ from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.importing import read_npy
 from lab.benchmarks.dexgraspbench import OFFICIAL, OURS, PALM
-from lab.benchmarks.report import emit, rate
+from lab.benchmarks.report import emit, options_of, rate
 
 TORSION = 0.02
 """Torsional friction of the official evaluation [m]; only the other coefficient is changed."""
@@ -39,14 +39,13 @@ TORSION = 0.02
 
 def main() -> None:
     """Write, evaluate twice, compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("clone", type=Path, help="clone of DexGraspBench")
     parser.add_argument("--python", default="python", help="interpreter with the benchmark's requirements")
     parser.add_argument("--work", type=Path, required=True, help="folder of dexgraspbench.py")
     parser.add_argument("--own", default="shadowhand", help="hand of our grasps")
     parser.add_argument("--friction", type=float, nargs="+", default=[0.6, 0.4], help="coefficients; the benchmark's is 0.6")
     parser.add_argument("--every", type=int, default=1, help="take every K-th official grasp of each object and scale")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows, found = [], {}

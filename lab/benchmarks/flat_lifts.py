@@ -8,7 +8,6 @@ is narrower than that of the built-in robots, so that two of its edges are withi
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from dro_grasp.arm.tabletop.experiment import TabletopConfig, attempt
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.predictor import GraspPredictor
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 TABLE = Table(0.0, (0.45, 0.0), (1.2, 0.6))
 """What things lie on [m]: as deep as the reach of the arms around its edges allows."""
@@ -39,13 +38,12 @@ def row(robot: str, name: str, asked: int, done: list[Attempt]) -> list[object]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--robot", required=True)
     parser.add_argument("--object", required=True)
     parser.add_argument("--attempts", type=int, default=5)
     parser.add_argument("--first", type=int, default=0, help="number of the first attempt")
     parser.add_argument("--no-slide", action="store_true", help="as a control, without pushes")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
     robot, obj, predictor = replace(load_robot(arguments.robot), table=TABLE), load_object(arguments.object), GraspPredictor()
     config = TabletopConfig(segment="mask", region=REGION, slide=not arguments.no_slide)

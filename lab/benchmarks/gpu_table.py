@@ -26,7 +26,7 @@ from typing import Any
 from dro_grasp.devices import require_device
 from dro_grasp.simulation.worlds import WARP
 from lab.benchmarks.device import MANY, ONE, SHARES, SINGLE
-from lab.benchmarks.report import emit, machine, note
+from lab.benchmarks.report import emit, machine, note, options_of
 from lab.measurements import STORED
 from lab.runner import PACKAGE, code_hash, weights_hashes
 
@@ -158,12 +158,11 @@ def lines(found: dict[str, Found]) -> list[list[object]]:
 
 def main(argv: list[str] | None = None) -> None:
     """Measure what is missing, and print all that there is."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--minutes", type=float, default=8.0, help="no part goes on after this time [min]")
     parser.add_argument("--record", type=Path, default=Path("out/gpu.jsonl"), help="file of what is found")
     parser.add_argument("--show", action="store_true", help="print what was found, and measure nothing")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     if not options.show:
         require_device("cpu" if options.device in SMALL else options.device)

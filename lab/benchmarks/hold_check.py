@@ -22,7 +22,6 @@ forum.universal-robots.com (thread 229: ten weighings with a Robotiq FT 300).
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
@@ -48,7 +47,7 @@ from dro_grasp.simulation.payload import servo_torques
 from dro_grasp.simulation.protocols import ROBUST
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import scene_of
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = {"allegro": "allegro", "barrett": "barrett", "leaphand": "leaphand", "shadowhand": "shadowhand", "gripper3": "gripper3"}
 """Built-in hands, and the files of their training grasps."""
@@ -281,7 +280,7 @@ def calibration(found: list[Measured], said: list[HoldCheck], about: tuple[str, 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
     parser.add_argument("--objects", type=int, default=12)
     parser.add_argument("--grasps", type=int, default=6)
@@ -289,7 +288,6 @@ def main() -> None:
     parser.add_argument("--group", default="builtin:train", help="objects of these grasps")
     parser.add_argument("--most", type=int, help="at most so many situations of each kind, of each hand")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     size = (args.hands, args.objects, args.grasps, args.seed)
     found = some(generated(*size, args.group) if args.generated else gathered(*size), args.most, args.seed)

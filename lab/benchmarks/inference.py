@@ -11,7 +11,6 @@ wait as the commands let them, asleep.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import subprocess
@@ -35,7 +34,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""
@@ -85,8 +84,7 @@ def measure(predictor: GraspPredictor, num: int, runs: int, seed: int) -> dict[s
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--full", action="store_true", help=f"{FULL} runs a hand, not {RUNS}; 16 grasps busy too")
     parser.add_argument("--threads", type=int, default=cores())
     parser.add_argument("--seed", type=int, default=0)

@@ -10,7 +10,6 @@ Convergence: exact targets, joints uniform within the limits, wrist uniform on S
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics import joint_solver
 from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 from dro_grasp.hands.library import load_hand
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 ASSET_HANDS = (
     "barrett_multidex", "allegro_left", "shadowhand", "barrett", "leaphand", "inspire", "ability", "dclaw", "orca",
@@ -192,8 +191,7 @@ def reached(hand: Hand, n: int, seed: int) -> tuple[float, float]:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--full", action="store_true", help="all 64 grasps through CVXPY, 10,000 clean targets a hand")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()

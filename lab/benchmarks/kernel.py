@@ -9,7 +9,6 @@ weights, threads and matrix-product precision. Peak memory is the growth of the 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import multiprocessing
 import statistics
@@ -26,7 +25,7 @@ from torch.nn import functional
 from dro_grasp.devices import fast_products
 from dro_grasp.network.distance_head import DistanceHead
 from dro_grasp.network.presets import NetworkConfig
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 BLOCKS = 4
 """Blocks along each side of the matrix in the naive form. Source: appendix, matrix block computation."""
@@ -105,8 +104,7 @@ def products(quick: bool) -> contextlib.AbstractContextManager[None]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--full", action="store_true", help=f"{FULL} runs instead of {RUNS}")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)

@@ -10,7 +10,6 @@ again. Needs the extra `[arm]`; the mean grasp needs a bundle of training grasps
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,7 +36,7 @@ from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.controls import MeanGrasp, mean_grasps
 from dro_grasp.predict.stages import complete
 from dro_grasp.training.data.bundle.training_file import load_bundle
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 ROWS = {
     "cloud": TabletopConfig(),
@@ -96,7 +95,7 @@ def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--output", type=Path, help="folder of the attempts; they are not stored without")
     parser.add_argument("--robots", nargs="+", default=["xarm7_leaphand", "ur5e_allegro"])
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=["cloud", "mesh", "random"])
@@ -105,7 +104,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--bundle", type=Path, help="training grasps, for the mean grasp")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
     if "mean grasp" in arguments.rows and arguments.bundle is None:
         parser.error("the mean grasp needs training grasps: --bundle PATH")

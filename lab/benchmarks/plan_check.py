@@ -10,7 +10,6 @@ fingers and the points of objects and other things by their distance; limits by 
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import joint_addresses
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 FINER = 10
 """Configurations that are checked for each sample of a plan (ours)."""
@@ -95,9 +94,8 @@ def nearest(made: MotionPlan, robot: Robot, arm: np.ndarray, hand: np.ndarray, s
 
 def main() -> None:
     """Check and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
     found: dict[str, list[tuple[int, int, bool, float]]] = {}
     scenes: dict[tuple[str, float | None], Scene] = {}

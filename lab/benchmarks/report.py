@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -33,6 +34,13 @@ def machine() -> dict[str, str | int]:
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "commit": commit() or "unknown",
     }
+
+
+def options_of(docstring: str | None) -> argparse.ArgumentParser:
+    """A parser of a benchmark's options, which explains it by its docstring and knows --json."""
+    parser = argparse.ArgumentParser(description=docstring, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser
 
 
 def emit(

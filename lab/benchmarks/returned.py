@@ -9,7 +9,6 @@ wait as the commands let them, asleep. `lab.benchmarks.inference` tells of the p
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import sys
@@ -21,7 +20,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = ("allegro", "barrett")
 OBJECTS = ("bottle", "can", "torus")
@@ -41,12 +40,11 @@ def measure(predictor: GraspPredictor, hand: str, obj: str, num: int, seeds: int
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--num", nargs="+", type=int, default=[1, 16], help="grasps of a prediction")
     parser.add_argument("--hands", nargs="+", default=list(HANDS))
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     predictor, rows, seconds = GraspPredictor(), list[list[object]](), dict[str, float]()
     for num in options.num:

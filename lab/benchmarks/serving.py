@@ -9,7 +9,6 @@ numbers. With as many clients as wait, an answer ideally takes as long as that m
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import subprocess
@@ -26,7 +25,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.apps.server.client import GraspClient
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 LONE = 12
 """Lone calls that are timed before the load, after as many that are not, and again after it."""
@@ -71,8 +70,7 @@ def memory(client: GraspClient, process: int) -> tuple[float, float]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Start a server, load it, print; 1 if an answer is missing or wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--clients", type=int, default=8)
     parser.add_argument("--requests", type=int, default=500)
     parser.add_argument("--hand", default="gripper3")

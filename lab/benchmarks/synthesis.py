@@ -9,7 +9,6 @@ and an object is counted separately, with grid and convex parts from the cache.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -25,7 +24,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.training.data.engine.worker import EngineConfig, Wanted, valid_grasps_of_all
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The paper hands."""
@@ -67,8 +66,7 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--full", action="store_true", help="all 48 training objects")
     parser.add_argument("--seed", type=int, default=0, help="draws the objects and the grasps")
     parser.add_argument("--protocol", default=DEFAULT_PROTOCOL, choices=list(PROTOCOLS), help="that grasps must pass")

@@ -8,7 +8,6 @@ collision shapes, in pregrasp, grasp and squeeze, of all grasps together; no sta
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_names
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.protocols import PROTOCOLS
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 DIRECTIONS = {"above": (0.0, 0.0, -1.0), "side": (1.0, 0.0, 0.0)}
 """Palm directions."""
@@ -109,14 +108,13 @@ def measure(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hands", nargs="+", default=["allegro", "barrett"])
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), help="the usual built-in ones by default")
     parser.add_argument("--source", choices=(AUTO, *source_names()), default=AUTO)
     parser.add_argument("--num", type=int, default=16, help="grasps that are asked for")
     parser.add_argument("--trials", choices=list(PROTOCOLS), help="also evaluate under a protocol; closing on the table")
     parser.add_argument("--sides", nargs="+", choices=tuple(DIRECTIONS), default=list(DIRECTIONS))
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     predictor, request = GraspPredictor(), GraspRequest(options.num, source=options.source)
     rows = []

@@ -33,7 +33,7 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, ObjectCloud, write_bundle
 from dro_grasp.training.loop import train
-from lab.benchmarks.report import emit, note
+from lab.benchmarks.report import emit, note, options_of
 
 HANDS = ("allegro", "barrett", "gripper3", "leaphand", "shadowhand")
 OBJECTS, FLAT = 48, 0.004
@@ -139,7 +139,7 @@ def other_speeds(options: argparse.Namespace) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--quick", action="store_true", help="one batch of each preset")
     parser.add_argument("--profile", action="store_true", help="also profile one step of each")
@@ -147,7 +147,6 @@ def main() -> None:
     parser.add_argument("--against", type=Path, help="source folder of another state of the package")
     parser.add_argument("--record", type=Path, help="file to which each result is appended as it is found")
     parser.add_argument("--label", default="", help=argparse.SUPPRESS)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     require_device(options.device)
     before = other_speeds(options) if options.against else {}

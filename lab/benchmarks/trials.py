@@ -24,7 +24,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.simulation.trial import TrialResult, simulate
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The paper hands."""
@@ -87,8 +87,7 @@ def rate(runs: list[Run]) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = options_of(__doc__)
     parser.add_argument("--full", action="store_true", help=f"{FULL} grasps a pair instead of {SAMPLE}")
     parser.add_argument("--seed", type=int, default=0, help="of the synthesis")
     parser.add_argument("--protocol", default=DEFAULT_PROTOCOL, choices=list(PROTOCOLS))

@@ -8,7 +8,6 @@ cluster for it, the files, and their bytes. Start and loading of the workers are
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.training.data.engine.pools import Pool, RayPool
 from dro_grasp.training.data.engine.schedule import synthesize_dataset
 from dro_grasp.training.data.engine.worker import EngineConfig, Job
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HAND = "gripper3"
 SMALL = EngineConfig(candidates=32, max_barren_rounds=1, synthesis=SynthesisConfig(steps=20))
@@ -53,11 +52,10 @@ def head_seconds(engine: str) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--processes", nargs="+", type=int, default=[1, 2, 4])
     parser.add_argument("--shards", type=int, default=6, help="of each process")
     parser.add_argument("--engine", choices=("local", "ray"), default="local")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     run(1, options.shards * max(options.processes), options.engine)  # convex parts and grids come to the cache
     rows: list[list[float]] = []

@@ -32,7 +32,7 @@ from pathlib import Path
 
 from dro_grasp.errors import DroGraspError
 from dro_grasp.files import replacing
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 from lab.fuzz.targets import TARGETS, attempt, make_seeds
 
 LONGEST = 20.0
@@ -214,14 +214,13 @@ def cpu_seconds(process: int) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, run, print; 1 if there are failures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--record", type=Path)
     parser.add_argument("--only", type=int)
     parser.add_argument("--keep", type=Path)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="fuzz-seeds-") as name:
         seeds = Path(name)

@@ -11,7 +11,6 @@ only its ending is compared.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import shutil
@@ -27,7 +26,7 @@ from pathlib import Path
 from safetensors.torch import load_file
 
 from dro_grasp.grasps.batch import GraspBatch
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 COMMAND = (sys.executable, "-m", "dro_grasp")
 """The command under test."""
@@ -144,8 +143,7 @@ def measure(name: str, job: Job, shares: Sequence[float], root: Path) -> list[li
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, run, print; 1 if a rerun differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true")
+    parser = options_of(__doc__)
     parser.add_argument("--shares", type=float, nargs="+", default=[0.3, 0.7])
     parser.add_argument("--jobs", nargs="+", default=["generate", "synthesize", "train", "onboard"])
     args = parser.parse_args(arguments)

@@ -10,7 +10,6 @@ grey. Needs the development assets.
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from dro_grasp.objects.perception.completion import complete_cloud, to_view_axes
 from dro_grasp.objects.perception.partial_views import visible_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.sheets import contact_sheet
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 GROUPS = ("assets:train", "assets:validate")
 TILE, COLUMNS, DRAWN = (260, 240), 5, 500
@@ -96,10 +95,9 @@ def tile(obj: ObjectModel) -> np.ndarray:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--views", type=int, default=3, help="views of each object; 0 for the picture alone")
     parser.add_argument("--picture", type=Path, default=None, help="PNG to draw")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     if options.picture is not None:
         draw(options.picture)

@@ -8,7 +8,6 @@ what each least confidence costs of the grasps that hold, and drops of those tha
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from itertools import product
 from pathlib import Path
@@ -30,7 +29,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.made_hands.making import hand_name, make_hand
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 FIRST_MADE = 9000  # Seed of the first made-up hand: no weights have seen it
 LEVELS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.5)  # Least confidences whose price is told
@@ -61,14 +60,13 @@ def returned(
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hands", nargs="*", default=[], help="names or files of hands")
     parser.add_argument("--made", type=int, default=0, help="made-up hands beside them")
     parser.add_argument("--objects", nargs="+", default=["builtin:hard_train"], help="names, files or groups of objects")
     parser.add_argument("--view", choices=get_args(View), default="whole", help="what is seen of the objects")
     parser.add_argument("--num", type=int, default=8, help="grasps of each pair")
     parser.add_argument("--protocol", default="carry", help="trial")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     predictor, objects = GraspPredictor(), resolve_objects(options.objects)
     pairs = []

@@ -39,7 +39,7 @@ from dro_grasp.training.loop import train
 from dro_grasp.training.measures import distance_errors
 from dro_grasp.training.pretraining import pretrain
 from dro_grasp.training.runs import last_logged
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 from lab.benchmarks.synthesis import HANDS
 
 PROTOCOLS = ("dro", "strict")
@@ -180,7 +180,7 @@ def mean_and_margin(values: Sequence[float]) -> tuple[float, float]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Train, evaluate and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--bundle", type=Path, required=True, help="training bundle that holds the hands")
     parser.add_argument("--validation", type=Path, help="validate bundle, for the errors of distances")
     parser.add_argument("--output", type=Path, required=True, help="folder for runs, weights and results")
@@ -193,7 +193,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands of training and trials")
     parser.add_argument("--objects", nargs="+", default=["assets:validate"], help="objects of the trials")
     parser.add_argument("--num", type=int, default=40, help="grasps of each hand on each object and seed")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     options.output.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,6 @@ tried have no payload to compare, and are counted.
 
 from __future__ import annotations
 
-import argparse
 import random
 import time
 from collections.abc import Iterator
@@ -39,7 +38,7 @@ from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import TrialScene, scene_of
 from dro_grasp.simulation.trial import run_trial
 from dro_grasp.simulation.weighing import WeighingConfig, observed
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 ROUNDS = 7  # Halvings of the interval
 INTERVALS = (0.01, 20.0), (0.013, 15.0)  # Masses between which payloads are looked for, each time [kg]
@@ -133,13 +132,12 @@ def summary(rows: list[dict[str, float | str]]) -> list[list[object]]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--hands", nargs="+", default=["assets/barrett_multidex", "assets/allegro_left", "leaphand"])
     parser.add_argument("--objects", nargs="+", default=["builtin:hard_train", "assets:train"], help="groups, drawn from alike")
     parser.add_argument("--pairs", type=int, default=12)
     parser.add_argument("--grasps", type=int, default=6, help="grasps of each pair")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     draw, groups = random.Random(options.seed), [resolve_objects([group]) for group in options.objects]

@@ -12,7 +12,6 @@ The folder keeps each pair, so a stopped study resumes.
 
 from __future__ import annotations
 
-import argparse
 import random
 from itertools import product
 from pathlib import Path
@@ -35,7 +34,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.trial import simulate
-from lab.benchmarks.report import emit
+from lab.benchmarks.report import emit, options_of
 
 HANDS = ["allegro", "barrett", "gripper3", "leaphand", "shadowhand"]
 VIEWS: tuple[View, ...] = ("depth", "half")
@@ -84,13 +83,12 @@ def odds(weights: Float[Tensor, "3"], features: Float[Tensor, "n 2"]) -> Float[T
 
 def main() -> None:
     """Collect, fit, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__)
     parser.add_argument("--folder", type=Path, required=True, help="where pairs are kept")
     parser.add_argument("--hands", nargs="+", default=HANDS)
     parser.add_argument("--objects", nargs="+", default=["builtin:train"], help="training objects, never others")
     parser.add_argument("--num", type=int, default=16, help="grasps of each pair")
     parser.add_argument("--pairs", type=int, default=120, help="pairs of hand, object and view, drawn at random")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.folder.mkdir(parents=True, exist_ok=True)

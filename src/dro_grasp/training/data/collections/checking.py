@@ -14,9 +14,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
-from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.training.data.collections.collection import PairGrasps, Sources
+from dro_grasp.training.data.collections.collection import PairGrasps, sound_sources
 
 Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps in all)
 
@@ -83,12 +82,8 @@ def check(
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
-    total, done, sources = sum(map(len, parts)), 0, Sources()
-    # All are found before the first trial: none is lost to a file that has changed, or to a bare cloud.
-    pairs = [sources.of(grasps) for grasps in parts]
-    for pair in pairs:
-        require_simulable(*pair)
-    for grasps, pair in zip(parts, pairs, strict=True):
+    total, done = sum(map(len, parts)), 0
+    for grasps, pair in zip(parts, sound_sources(parts), strict=True):
         yield pair
         done += len(grasps)
         if progress is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, recorded_mas
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.training.data.engine.shards import Yield, find_shards, read_yield
 
 YIELDS = "yields"  # Entry of a file's notes with the yield of each of its objects
@@ -49,6 +50,15 @@ class Sources:
         obj = self.objects[heavy] = self.objects.get(heavy) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
         return hand, obj
+
+
+def sound_sources(parts: Iterable[GraspBatch]) -> list[tuple[Hand, ObjectModel]]:
+    """Hand and object of each, found before the first trial: none is lost to a file that has changed, or to a bare cloud."""
+    sources = Sources()
+    pairs = [sources.of(grasps) for grasps in parts]
+    for pair in pairs:
+        require_simulable(*pair)
+    return pairs
 
 
 def yield_notes(yields: Mapping[str, Yield]) -> dict[str, Any]:

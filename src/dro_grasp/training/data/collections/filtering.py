@@ -27,9 +27,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import refine
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
-from dro_grasp.training.data.collections.collection import PairGrasps, Sources, yield_notes
+from dro_grasp.training.data.collections.collection import PairGrasps, Sources, sound_sources, yield_notes
 from dro_grasp.training.data.collections.merging import file_name
 from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_rest, closed_where_they_hold
 from dro_grasp.training.data.engine.pools import LocalPool, attempt
@@ -182,7 +181,7 @@ def filter_dataset(
     if workers < 1:
         raise OptionError(f"workers is {workers}; give at least 1")
     given = list(pairs)
-    _require_sound(given)
+    sound_sources(pair.grasps for pair in given if len(pair.grasps))
     folder = make_folder(output)
     tasks = _tasks(given)
     with sole_run(folder):
@@ -204,14 +203,6 @@ def filter_dataset(
         whole = [task.shard for task in tasks if (task.shard.hand, task.shard.object) not in given_up]
         _join(folder, whole)
         return FilterReport(tuple(read_kept(folder, shard) for shard in whole), given_up)
-
-
-def _require_sound(pairs: Sequence[PairGrasps]) -> None:
-    """Find all hands and objects before the first trial: none is lost to a file that has changed, or to a bare cloud."""
-    sources = Sources()
-    for pair in pairs:
-        if len(pair.grasps):
-            require_simulable(*sources.of(pair.grasps))
 
 
 def _begin(folder: Path, config: FilterConfig) -> None:
