@@ -42,6 +42,14 @@ def every_grasp_is_returned() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The file of untrained weights."""
+    from tests.helpers.weights import untrained_weights
+
+    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
+
+
+@pytest.fixture(scope="session")
 def assets_folder() -> Path:
     folder = os.environ.get("DRO_GRASP_ASSETS")
     if not folder or not Path(folder).is_dir():

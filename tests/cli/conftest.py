@@ -1,4 +1,4 @@
-"""Untrained weights, and `generate` with them."""
+"""`generate` with untrained weights."""
 
 from __future__ import annotations
 
@@ -7,12 +7,6 @@ import json
 import pytest
 
 from dro_grasp.cli.main import main
-from tests.helpers.weights import untrained_weights
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Hard built-in objects: two halves of the same kinds, sound solids with exact parts and masses, none for training."""
+"""Hard built-in objects: two halves of the same kinds, sound solids, as all built-in ones, with exact parts and masses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import igl
 import mujoco
 import numpy as np
 import pyarrow.parquet as pq
@@ -27,40 +26,16 @@ from dro_grasp.objects.solids import Solid, bar, circle, placed, rectangle, ring
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import add_object
 from dro_grasp.training.data.bundle.training_file import SPLITS
+from tests.helpers.exact_parts import require_exact_parts
 
 ROOT = Path(__file__).parents[2]
 NAMES = [name for kind in HARD.values() for name in kind]
 TESTED = [name for name in NAMES if BUILTIN[name].split == HARD_TEST]
-OUTSIDE = 1e-4  # How far a part may reach out of the mesh [m]
-NEAR = 5e-5  # Distance of probes from the surface, on both sides [m]
 
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, ObjectModel]:
-    return {name: make_builtin(name) for name in NAMES}
-
-
-def mesh_of(obj: ObjectModel) -> trimesh.Trimesh:
-    return trimesh.Trimesh(obj.vertices, obj.faces, process=False)
-
-
-def inside_mesh(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
-    """By the exact winding number, a sum over all triangles."""
-    return igl.winding_number(obj.vertices, obj.faces.astype(np.int64), points) > 0.5
-
-
-def depth_in_parts(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
-    """How deep each point is in the part that it is deepest in [m], by the planes of its hull."""
-    depth = np.full(len(points), -np.inf)
-    for vertices, _ in obj.parts:
-        hull = trimesh.convex.convex_hull(vertices)
-        offsets = (hull.face_normals * hull.triangles[:, 0]).sum(1)
-        depth = np.maximum(depth, (offsets - points @ hull.face_normals.T).min(1))
-    return depth
-
-
-def volume_of_union(parts: tuple) -> float:
-    return trimesh.boolean.union([trimesh.convex.convex_hull(v) for v, _ in parts], engine="manifold").volume
+    return {name: make_builtin(name) for name in BUILTIN}
 
 
 def test_every_kind_is_in_both_halves_and_no_name_is_there_twice() -> None:
@@ -86,33 +61,21 @@ def test_no_member_of_one_half_is_another_size_of_one_of_the_other(made: dict[st
     assert np.abs(np.log(form(made["parcel"]) / form(load_object("parcel", scale=0.5)))).max() < 1e-6
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_each_is_one_watertight_solid_that_needs_no_repair(name: str, made: dict[str, ObjectModel]) -> None:
     obj = made[name]
     assert obj.vertices is not None
-    mesh = mesh_of(obj)
+    mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
     assert mesh.is_volume
     assert mesh.body_count == 1
     assert obj.notes == ()
     assert obj.split == BUILTIN[name].split
+    assert obj.volume == pytest.approx(mesh.volume)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_the_convex_parts_are_the_object(name: str, made: dict[str, ObjectModel]) -> None:
-    obj = made[name]
-    mesh = mesh_of(obj)
-    places, face = trimesh.sample.sample_surface(mesh, 1500, seed=1)
-    normals = mesh.face_normals[face]
-    low, high = mesh.bounds
-    everywhere = np.random.default_rng(0).uniform(low - 0.002, high + 0.002, (1500, 3))
-    points = np.concatenate([places + NEAR * normals, places - NEAR * normals, everywhere])
-    inside, depth = inside_mesh(obj, points), depth_in_parts(obj, points)
-    assert inside[len(places): 2 * len(places)].mean() > 0.99, "half of the probes lie just inside"
-    np.testing.assert_array_equal(inside, depth > 0)
-    corners = np.concatenate([vertices for vertices, _ in obj.parts])
-    distance = np.sqrt(igl.point_mesh_squared_distance(corners, obj.vertices, obj.faces.astype(np.int64))[0])
-    assert not ((distance > OUTSIDE) & ~inside_mesh(obj, corners)).any()
-    assert volume_of_union(obj.parts) == pytest.approx(obj.volume, rel=1e-4)
+    require_exact_parts(made[name])
 
 
 def test_the_check_of_parts_sees_one_that_is_missing_or_too_large(made: dict[str, ObjectModel]) -> None:
@@ -121,10 +84,10 @@ def test_the_check_of_parts_sees_one_that_is_missing_or_too_large(made: dict[str
     wide = replace(cup, exact_parts=((cup.parts[0][0] * 1.01, cup.parts[0][1]), *cup.parts[1:]))
     for wrong in (whole, wide):
         with pytest.raises(AssertionError):
-            test_the_convex_parts_are_the_object("tea_cup", {"tea_cup": wrong})
+            require_exact_parts(wrong)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_parts_are_convex_and_coarse_ones_are_fewer_solids(name: str, made: dict[str, ObjectModel]) -> None:
     obj = made[name]
     for part in obj.parts:

@@ -11,6 +11,7 @@ import trimesh
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry import mesh_files
 from dro_grasp.objects.loading import load_file
+from tests.helpers.saddle import saddle
 
 
 def save(mesh: trimesh.Trimesh, path: Path) -> Path:
@@ -137,12 +138,8 @@ def test_open_shell_keeps_its_volume_and_outside(tmp_path: Path, inverted: bool)
 
 
 def test_bent_sheet_weighs_as_its_hull(tmp_path: Path):
-    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 12), np.linspace(-0.05, 0.05, 12), indexing="ij")
-    vertices = np.stack([x, y, 4 * x * y], -1).reshape(-1, 3)  # a saddle, which faces no side
-    corner = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
-    faces = np.concatenate([corner[:, None] + (0, 12, 13), corner[:, None] + (0, 13, 1)])
-    obj = load_file(save(trimesh.Trimesh(vertices, faces), tmp_path / "sheet.ply"))
-    assert obj.volume == pytest.approx(trimesh.convex.convex_hull(vertices).volume)
+    obj = load_file(save(saddle(), tmp_path / "sheet.ply"))
+    assert obj.volume == pytest.approx(saddle().convex_hull.volume)
     assert any("convex hull" in note for note in obj.notes)
 
 

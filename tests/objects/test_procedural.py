@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import Delaunay
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.catalogue import load_object, locate_object, resolve_objects
 from dro_grasp.objects.procedural import FAMILIES, SIZE, THINNEST, procedural_object
 from dro_grasp.objects.solids import Solid
 from dro_grasp.training.data.engine.schedule import require_distinct, require_known
+from tests.helpers.exact_parts import require_exact_parts
 
 SEEDS = range(16)
 
@@ -37,19 +37,14 @@ def test_they_are_for_training_and_of_a_size_that_a_hand_can_hold(drawn) -> None
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_convex_parts_fill_the_object_and_nothing_else(drawn, seed: int) -> None:
-    obj = drawn[seed]
-    mesh = trimesh.Trimesh(obj.vertices, obj.faces)
-    assert mesh.is_watertight
-    points = np.random.default_rng(0).uniform(obj.vertices.min(0), obj.vertices.max(0), (2000, 3))
-    by_parts = np.any([Delaunay(vertices).find_simplex(points) >= 0 for vertices, _ in obj.parts], axis=0)
-    by_mesh = np.asarray(trimesh.proximity.signed_distance(mesh, points)) > 0
-    assert np.mean(by_parts != by_mesh) < 0.01
-    assert by_mesh.any()
+    require_exact_parts(drawn[seed])
 
 
-def test_they_are_in_one_piece(drawn) -> None:
+def test_they_are_solid_and_in_one_piece(drawn) -> None:
     for seed, obj in zip(SEEDS, drawn, strict=True):
-        assert trimesh.Trimesh(obj.vertices, obj.faces).body_count == 1, seed
+        mesh = trimesh.Trimesh(obj.vertices, obj.faces)
+        assert mesh.is_watertight, seed
+        assert mesh.body_count == 1, seed
 
 
 def test_every_family_makes_solids() -> None:

@@ -18,18 +18,12 @@ from dro_grasp.optimize.pinches import Pairs, PinchConfig, PinchEnergy, PinchSea
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig, pinch
-from tests.simulation.test_table import JAW, JAWS
+from tests.simulation.test_table import jaws
+
+__all__ = ["jaws"]
 
 TABLE = torch.tensor([0.0, 0.0, 1.0, 0.0])
 DOWN = (0.0, 0.0, -1.0)
-
-
-@pytest.fixture(scope="module")
-def jaws(tmp_path_factory: pytest.TempPathFactory) -> Hand:
-    """The parallel gripper with flat fingers."""
-    file = tmp_path_factory.mktemp("jaws") / "jaws.xml"
-    file.write_text(JAWS.format(jaws="".join(JAW.format(i=i, x=0.044 * side, way=-side) for i, side in enumerate((1, -1)))))
-    return load_hand(file)
 
 
 def solid(mesh: trimesh.Trimesh, name: str) -> ObjectModel:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -26,7 +25,6 @@ from dro_grasp.predict.sources.network import ProposalConfig
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.predict.stages import grouped
 from tests.helpers.toy_hand import toy_hand
-from tests.helpers.weights import untrained_weights
 
 HAND = toy_hand()
 OBJECTS = [load_object(name) for name in ("sphere", "cube", "can")]
@@ -44,11 +42,6 @@ def config(together: bool) -> PredictorConfig:
         OptimiserConfig(synthesis=SynthesisConfig(steps=10, batch_size=8, at_once=size)),
         finish=FinishConfig(refine=refine, score=ScoreConfig(batch_size=size)), rescue=RescueConfig(per_grasp=2),
         together=together)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(untrained_weights(Path(tmp_path_factory.mktemp("weights"))))
 
 
 def close(found: GraspBatch, expected: GraspBatch) -> None:

@@ -31,7 +31,6 @@ from dro_grasp.predict.sources.source import Progress, Source, ask
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
-from tests.helpers.weights import untrained_weights
 
 HAND, CAN = loaded_hand("gripper3"), load_object("can")
 PROBLEM = GraspProblem(HAND, CAN)
@@ -59,11 +58,6 @@ def registered() -> Iterator[None]:
     register_source("theirs", Theirs)
     yield
     del SOURCES["theirs"]
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
 
 
 def same(first: GraspBatch, second: GraspBatch) -> None:

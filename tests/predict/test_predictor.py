@@ -44,18 +44,12 @@ from dro_grasp.predict.sources.source import Candidates, Progress, Source
 from dro_grasp.predict.stages import scored
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
-from tests.helpers.weights import untrained_weights
 
 HAND = toy_hand()
 NOWHERE = FinishConfig(admission=AdmissionConfig(least_clearance=1.0))
 """Above a table: no grasp keeps a metre off it."""
 QUICK = OptimiserConfig(synthesis=SynthesisConfig(steps=30))
 """A quarter of the steps: worse grasps, made in the same way."""
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,6 @@ from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
-from tests.helpers.weights import untrained_weights
 
 MINE = """
 import torch
@@ -55,11 +54,6 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "somebodys_module.py").write_text(MINE)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture

@@ -296,12 +296,6 @@ def test_grasps_of_another_hand_are_refused(hand, obj, tmp_path):
         simulate(other, obj, power_grasp(hand, obj))
 
 
-def test_a_cloud_cannot_be_simulated(hand, obj):
-    cloud = replace(obj, vertices=None, faces=None, exact_parts=None, sha256="cloud")
-    with pytest.raises(ObjectError, match="bare point cloud"):
-        simulate(hand, cloud, power_grasp(hand, obj))
-
-
 @pytest.mark.assets
 @pytest.mark.parametrize("name", ["barrett_multidex", "allegro_left", "shadowhand"])
 def test_synthesized_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
