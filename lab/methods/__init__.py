@@ -4,3 +4,5 @@ from pathlib import Path
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 """Folder of their weights."""
+EXPECTED = "weights of this method; train them again (`python -m lab.methods.train`)"
+"""What a file with them should be, and a remedy."""

@@ -30,7 +30,7 @@ from dro_grasp.objects.loading import estimate_normals, mesh_object
 from dro_grasp.objects.perception.completion import CODED, GUESSES, THINNEST, surface_features, to_view_axes
 from dro_grasp.objects.perception.depth_noise import NoiseName
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
-from dro_grasp.objects.perception.scan import without_outliers
+from dro_grasp.objects.perception.scan import ordinary
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
 from dro_grasp.provenance import made_by
@@ -162,7 +162,7 @@ def seen_of(obj: ObjectModel, kind: Kind, up: Float[np.ndarray, "3"], rng: np.ra
         points = points[points @ up - height > rng.uniform(*CUT)]
     if len(points) < FEWEST:
         return None
-    points, place = without_outliers(points), camera.place(obj, torch.from_numpy(towards))
+    points, place = points[ordinary(points)], camera.place(obj, torch.from_numpy(towards))
     normals = estimate_normals(points.astype(np.float32), place).astype(np.float64)
     table = np.append(up, height + LEVEL * rng.normal()) if kind == "table" else None
     known = table is not None or rng.uniform() < STANDING

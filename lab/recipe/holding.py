@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch.nn import functional
 
-from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.variants import vary_hand
@@ -41,6 +41,7 @@ from dro_grasp.provenance import made_by
 from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.made_hands.making import make_hand
+from lab.calibration import price_of_least, reliability
 from lab.recipe.parts import checksum, fill, fingerprint
 from lab.recipe.ranking import HANDS
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.cli.output import progress_bar
-from dro_grasp.compare.metrics import price_of_least, reliability, roc_area
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.compare.stages import pair_seed
 from dro_grasp.errors import NoGraspError
 from dro_grasp.hands.library import load_hand
@@ -30,6 +30,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.made_hands.making import hand_name, make_hand
 from lab.benchmarks.report import emit, options_of
+from lab.calibration import price_of_least, reliability
 
 FIRST_MADE = 9000  # Seed of the first made-up hand: no weights have seen it
 LEVELS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.5)  # Least confidences whose price is told

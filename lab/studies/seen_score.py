@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from dro_grasp.compare.metrics import reliability, roc_area
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.compare.stages import pair_seed
 from dro_grasp.errors import NoGraspError
 from dro_grasp.hands.library import load_hand
@@ -35,6 +35,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig
 from dro_grasp.simulation.trial import simulate
 from lab.benchmarks.report import emit, options_of
+from lab.calibration import reliability
 
 HANDS = ["allegro", "barrett", "gripper3", "leaphand", "shadowhand"]
 VIEWS: tuple[View, ...] = ("depth", "half")

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.network.checkpoints import load_into
+from dro_grasp.network.checkpoints import load_small, locate_weights
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
-from lab.methods import WEIGHTS
+from lab.methods import EXPECTED, WEIGHTS
 from lab.methods.gendexgrasp.contact_maps import sharpened
 from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
 from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
@@ -31,7 +31,7 @@ class GenDexGrasp(Source):
             WeightsError: They are missing or of another network.
         """
         self.config = config or FittingConfig()
-        self.network = load_into(ContactMapNetwork(), weights)
+        self.network = load_small(locate_weights(weights), lambda _: ContactMapNetwork(), EXPECTED)
 
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """Draw maps of the object, and fit the hand."""

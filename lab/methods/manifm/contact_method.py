@@ -21,12 +21,12 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.joint_solver import Targets, solve_joints
 from dro_grasp.kinds import Checked
-from dro_grasp.network.checkpoints import load_into
+from dro_grasp.network.checkpoints import load_small, locate_weights
 from dro_grasp.optimize.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimize.squeeze import gripping
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
-from lab.methods import WEIGHTS
+from lab.methods import EXPECTED, WEIGHTS
 from lab.methods.manifm.contact_network import LATENT, ContactNetwork
 from lab.methods.manifm.contact_training import open_hand_cloud
 from lab.methods.manifm.fingertip_contacts import Pads, contacts_of
@@ -61,7 +61,8 @@ class ContactMethod(Source):
         Raises:
             WeightsError: They are missing or of another network.
         """
-        self.config, self.network = config or ContactMethodConfig(), load_into(ContactNetwork(), weights)
+        self.config = config or ContactMethodConfig()
+        self.network = load_small(locate_weights(weights), lambda _: ContactNetwork(), EXPECTED)
 
     @torch.no_grad()
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:

@@ -95,13 +95,6 @@ def _check_tensors(expected: Tensors, given: Tensors, path: Path) -> None:
             raise WeightsError(f"{path}: '{name}' holds NaN, infinity, or a negative variance; train again")
 
 
-def load_into(network: Network, path: Path) -> Network:
-    """A network of a method beside D(R,O) with the weights of a file, in evaluation mode."""
-    tensors = _read(locate_weights(path))[1]
-    _check_tensors(network.state_dict(), tensors, path)
-    return _filled(network, tensors)
-
-
 def load_small(path: Path, make: Callable[[Tensors], Network], expected: str) -> Network:
     """A small network that ships beside those that predict D(R,O), in evaluation mode; its gradients are switched off.
 

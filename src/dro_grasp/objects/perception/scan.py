@@ -285,11 +285,6 @@ def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """The points that are no outliers."""
-    return points[ordinary(points)]
-
-
 def ordinary(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Points whose mean distance to their neighbours is not unusually large. Source: Rusu et al. 2008."""
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
