@@ -33,7 +33,7 @@ except dro_grasp.DroGraspError as error:
 def test_the_core_needs_no_extra_and_the_pages_say_what_to_install(tmp_path: Path) -> None:
     grasps, weights = str(tmp_path / "grasps.parquet"), str(untrained_weights(tmp_path))
     commands = [
-        ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--method", "network", "--weights", weights,
+        ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--source", "network", "--weights", weights,
          "--output", grasps, "--json"],
         ["evaluate", grasps, "--json"], ["export", grasps, "--format", "csv", "--output", str(tmp_path / "grasps.csv")],
         ["picture", grasps, "--output", str(tmp_path / "sheet.png"), "--size", "40", "40"],

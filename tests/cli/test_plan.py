@@ -54,8 +54,8 @@ def planned(asked: dict[str, Any], small_robot: str, monkeypatch: pytest.MonkeyP
 def test_every_option_reaches_the_planner_and_every_file_is_written(
     planned: Planned, asked: dict[str, Any], weights: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    palm = ["--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012"]
-    places = ["--hold", "0.5", "0.1", "0.2", "0.03", "--spare", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
+    palm = ["--direction", "0", "0", "-1", "--max-tilt", "0.6", "--pregrasp-clearance", "0.012"]
+    places = ["--contact-region", "0.5", "0.1", "0.2", "0.03", "--keep-out", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
     numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", weights,
                "--least-confidence", "0.35"]
     files = ["--output", "plan.npz", "--trajectory", "plan.yaml", "--csv", "plan.csv"]

@@ -230,7 +230,7 @@ def test_a_stored_answer_of_nothing_is_an_answer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [
-    "start", "auto", "network", "optimise", "mean-grasp", "", "my:source", "a@b", "a.parquet", "a/b"])
+    "start", "auto", "network", "optimiser", "mean-grasp", "", "my:source", "a@b", "a.parquet", "a/b"])
 def test_a_name_that_is_taken_or_means_something_else_is_refused(registering: Callable[..., None], name: str) -> None:
     with pytest.raises(OptionError, match=r"choose another name|is no name of a source"):
         registering(name, object)

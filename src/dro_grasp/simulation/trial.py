@@ -218,7 +218,7 @@ def after_closing(
     of `simulate`.
     """
     scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
-    for part, rollout in rollouts(scene, hand, grasps):
+    for part, rollout in rollouts(scene, hand, grasps, None):
         closed = rollout.close()
         sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         parts.append(_reached(part, rollout, hand, sound))
