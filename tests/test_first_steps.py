@@ -16,7 +16,6 @@ import dro_grasp as dro
 from dro_grasp.grasps.sources import hand_of, object_of, require_pair
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
-from tests.helpers.weights import untrained_weights
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +29,8 @@ def obj() -> dro.ObjectModel:
 
 
 @pytest.fixture(scope="module")
-def predictor(tmp_path_factory: pytest.TempPathFactory) -> dro.GraspPredictor:
-    return dro.GraspPredictor(str(untrained_weights(tmp_path_factory.mktemp("weights"))))
+def predictor(weights: str) -> dro.GraspPredictor:
+    return dro.GraspPredictor(weights)
 
 
 def test_help_opens_with_an_example_that_runs() -> None:

@@ -25,7 +25,6 @@ from dro_grasp.predict.stages import refine
 from dro_grasp.simulation.protocols import Protocol, changed, protocol
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
-from tests.helpers.weights import untrained_weights
 
 STRICT = "strict/1"
 LENIENT = Protocol("lenient", max_displacement=math.inf)
@@ -56,8 +55,8 @@ class Lazy(StartSource):
 
 
 @pytest.fixture(scope="module")
-def predictor(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
-    return GraspPredictor(str(untrained_weights(tmp_path_factory.mktemp("weights"))))
+def predictor(weights: str) -> GraspPredictor:
+    return GraspPredictor(weights)
 
 
 @pytest.fixture(scope="module")

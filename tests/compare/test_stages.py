@@ -47,7 +47,6 @@ from dro_grasp.simulation.trial import simulate
 from tests.helpers.bench_clone import clone_of_bars
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.one_object import settle_grasps
-from tests.helpers.weights import untrained_weights
 
 AUTO, START, OPTIMISER = "auto", "start", "optimiser"
 HANDS = ("gripper3", "barrett")
@@ -61,9 +60,9 @@ def rows() -> list[Row]:
 
 
 @pytest.fixture(scope="module")
-def untrained(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
+def untrained(weights: str) -> GraspPredictor:
     """For what does not ask how good grasps are."""
-    return GraspPredictor(str(untrained_weights(tmp_path_factory.mktemp("weights"))))
+    return GraspPredictor(weights)
 
 
 def every(predictor: GraspPredictor) -> list[Method]:

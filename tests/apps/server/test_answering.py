@@ -32,11 +32,10 @@ TUBE = trimesh.creation.cylinder(0.03, 0.1)
 
 
 @pytest.fixture(scope="module")
-def answerer(tmp_path_factory: pytest.TempPathFactory) -> Answerer:
-    weights = untrained_weights(tmp_path_factory.mktemp("weights"))
+def answerer(weights: str, tmp_path_factory: pytest.TempPathFactory) -> Answerer:
     own = tmp_path_factory.mktemp("own") / "own_tube.stl"
     TUBE.export(own)
-    return Answerer(ServerConfig(str(weights), hands=("gripper3",), objects=(str(own),)))
+    return Answerer(ServerConfig(weights, hands=("gripper3",), objects=(str(own),)))
 
 
 def ask(answerer: Answerer, obj: Any, **options: Any) -> GraspAnswer:
