@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 import shlex
 import shutil
 from collections import Counter
@@ -19,6 +20,7 @@ from dro_grasp.errors import BundleError, OptionError, OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.network.checkpoints import describe_weights
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
+from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.training import loop, onboarding
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.data.engine.shards import sole_run
@@ -97,6 +99,16 @@ def test_a_rerun_does_nothing_again(home: Path, made: Onboarded, capsys: pytest.
     for step in ("before", "after"):
         assert told[step]["returned"]["carry/1"] == made.rate(step, "returned", "carry/1")
         assert told["optimised"][step] == made.optimised(step)
+
+
+def test_a_report_says_of_which_object_no_grasp_was_found(made: Onboarded, tmp_path: Path) -> None:
+    """A confidence that no grasp has stands for an object that the hand cannot hold."""
+    none = PredictorConfig(finish=FinishConfig(least_confidence=1 - 1e-9))
+    done = replace(made, folder=tmp_path, config=replace(made.config, predictor=none))
+    shutil.copy(made.folder / onboarding.PICTURE, tmp_path)
+    page = write_report(done).read_text()
+    assert re.search("can: none was found: .*probability below", page)
+    assert "Next steps" in page
 
 
 def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
