@@ -229,6 +229,7 @@ def test_a_process_that_is_terminated_with_its_server_says_so() -> None:
     queue = RequestQueue(None, answerer=QuickAnswerer)
     running = submitted(queue, "running", "hang")
     os.kill(queue.ready.process, signal.SIGTERM)
+    time.sleep(0.3)  # it is known by then how the process ended, and not yet that the server stops
     queue.close(patience=20.0)
     assert running.reply.result(0).status == 503
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +21,7 @@ from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.network.checkpoints import DEFAULT, load_weights, save_weights
+from tests.helpers.processes import alive, children, start, wait_for
 
 QUICK = TabletopConfig(
     see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=8, best_seconds=30, planner_seconds=30))
@@ -134,6 +139,60 @@ def test_a_fault_loses_nothing_of_what_other_processes_make(small_robot: str, tm
     with pytest.raises(ValueError, match="a fault"):
         run_tabletop(TabletopRun(small_robot, ("torus", "can"), attempts=2), stored, workers=2, make=broken)
     assert sorted((a.object, a.number) for a in read_attempts(stored)) == [("can", 0), ("can", 1), ("torus", 0)]
+
+
+def deadly(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
+    """The second attempt with the torus ends its process, as a system does that is out of memory."""
+    if obj.name == "torus" and number:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Attempt(robot.name, obj.name, number, seed, TabletopConfig().label(), True, "done")
+
+
+def test_a_process_that_dies_loses_nothing_but_its_attempt(small_robot: str, tmp_path: Path) -> None:
+    stored, objects = tmp_path / "stored.parquet", ("torus", "can", "sphere")
+    with pytest.raises(OptionError, match=r"died over its attempt .*ask for fewer"):
+        run_tabletop(TabletopRun(small_robot, objects, attempts=2), stored, workers=2, make=deadly)
+    made = {(a.object, a.number) for a in read_attempts(stored)}
+    assert made == {(name, number) for name in objects for number in (0, 1)} - {("torus", 1)}
+
+
+def stuck(robot: dro.Robot, obj: dro.ObjectModel, number: int, *others: object) -> Attempt:
+    """The second attempt with an object takes for ever."""
+    Path(os.environ["MARKS"], f"{obj.name}-{number}").touch()
+    time.sleep(600 * number)
+    return deadly(robot, obj, 0, *others)
+
+
+PARENT = """
+import signal, sys
+from pathlib import Path
+from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
+from tests.arm.tabletop.test_tabletop import stuck
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
+    run_tabletop(TabletopRun(sys.argv[1], ("can", "torus", "sphere"), 2), Path(sys.argv[2]), workers=2, make=stuck)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_a_run_that_is_stopped_begins_nothing_more_and_keeps_what_has_ended(
+    small_robot: str, tmp_path: Path, end: signal.Signals
+) -> None:
+    script, output = tmp_path / "parent.py", tmp_path / "stored.parquet"
+    script.write_text(PARENT)
+    parent = start(script, small_robot, output, MARKS=str(tmp_path))
+    try:
+        wait_for(lambda: len(list(tmp_path.glob("*-1"))) == 2)  # both are at an attempt that takes for ever
+        wait_for(lambda: output.is_file() and len(read_attempts(output)) == 2)
+        started = children(parent.pid)
+        parent.send_signal(end)
+        parent.wait(20)
+    finally:
+        parent.kill()
+    wait_for(lambda: not any(alive(pid) for pid in started))
+    assert sorted((a.object, a.number) for a in read_attempts(output)) == [("can", 0), ("torus", 0)]
 
 
 def test_a_bare_cloud_is_refused_before_anything_is_attempted(small_robot: str, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -22,8 +21,8 @@ from dro_grasp.training.data.engine.shards import Shard, find_shards, read_yield
 from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
 from tests.helpers import engine_work
 from tests.helpers.engine_work import GRASPS
+from tests.helpers.processes import PATIENCE, alive, children, start, wait_for
 
-ROOT = Path(__file__).parents[3]
 PARENT = """
 import signal, sys
 from dro_grasp.training.data.engine.schedule import synthesize_dataset
@@ -33,8 +32,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
     synthesize_dataset(["a", "b"], ["x", "y"], 40, sys.argv[1], workers=lambda job: LocalPool(job, 2, 60, {work}))
 """
-PATIENCE = 300.0
-"""Deadline for what takes seconds on an idle machine [s]."""
 
 
 def pool(work, workers: int = 2, limit: float = 60.0):
@@ -127,22 +124,7 @@ def test_an_object_that_takes_too_long_is_stopped_and_the_rest_goes_on(tmp_path)
 def start_parent(tmp_path: Path, folder: Path) -> subprocess.Popen[bytes]:
     script = tmp_path / "parent.py"
     script.write_text(PARENT.format(work="slow"))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "src")])}
-    return subprocess.Popen([sys.executable, script, folder], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                            env=environment)
-
-
-def wait_for(condition) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-def children(pid: int) -> list[int]:
-    """Processes that a process has started and that run."""
-    lists = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
-    return [int(child) for part in lists for child in part]
+    return start(script, folder)
 
 
 def shards_appear(parent: subprocess.Popen[bytes], folder: Path, count: int) -> list[int]:
@@ -152,13 +134,6 @@ def shards_appear(parent: subprocess.Popen[bytes], folder: Path, count: int) -> 
     found = children(parent.pid)
     assert len(found) >= 2
     return found
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 @pytest.mark.slow

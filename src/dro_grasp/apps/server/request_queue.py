@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 from pebble import ProcessExpired, ProcessPool
 
 from dro_grasp.errors import DroGraspError, OptionError, ServerError
+from dro_grasp.workers import end_with_parent
 
 
 class Reply(NamedTuple):
@@ -43,6 +44,8 @@ TICKETS = 8  # Most refused requests whose turn is remembered, as a multiple of 
 LATE_SECONDS = 3.0  # How much later than it was told a refused request may come without losing its turn [s] (ours)
 USUAL_SECONDS = 2.0  # Computing time of a request, before any is known [s] (ours)
 STOP_SECONDS = 1.0  # How long a process that was terminated waits to hear whether the server stops [s] (ours)
+TERMINATED = (-signal.SIGTERM, signal.SIGTERM)
+"""Codes with which a process ends that was terminated: before and while its pool takes the signal, which exits with it."""
 STOPPED = refused(HTTPStatus.SERVICE_UNAVAILABLE, "the server is stopping; ask another one, or ask again once it runs")
 """The reply to a request that a stopping server does not answer any more."""
 CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")  # The reply to a request that is no longer wanted
@@ -69,6 +72,7 @@ class Computer:
     @classmethod
     def prepare(cls, cancelled: Any) -> None:
         """Start the process."""
+        end_with_parent()
         cls.cancelled = cancelled
 
     @classmethod
@@ -309,7 +313,7 @@ class RequestQueue:
 
     def _stops(self, error: BaseException) -> bool:
         """Whether the process ended because the server does: a service manager ends both at once."""
-        if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGTERM:
+        if isinstance(error, ProcessExpired) and error.exitcode in TERMINATED:
             begin = time.monotonic()
             while not self.closed and time.monotonic() - begin < STOP_SECONDS:
                 time.sleep(0.05)

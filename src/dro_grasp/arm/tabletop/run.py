@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pebble import ProcessExpired, ProcessPool
+
 from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
+from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts, write_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher, attempt, require_mesh
 from dro_grasp.arm.tabletop.table_scene import PickedObject
-from dro_grasp.devices import one_thread
+from dro_grasp.devices import cores
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.workers import use_one_thread
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ def run_tabletop(
         run: What is attempted.
         output: Parquet file; attempts with the same robot, objects, weights, settings and seed in it are not repeated, others
             stay. Files of the same names count as the same only if their contents are.
-        workers: Processes, which share out the objects; with several, attempts are stored object by object.
+        workers: Processes, which share out the attempts; with several, each is stored as it ends.
         progress: Called after each attempt.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
         make: Makes one, instead of `attempt`, with the same arguments.
@@ -138,41 +145,60 @@ def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
 def _results(
     run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None, make: Callable[..., Attempt]
 ) -> Iterator[Attempt]:
-    if workers <= 1 or len(missing) <= 1:
+    tasks = [(run, name, number, plans, make) for name, numbers in missing.items() for number in numbers]
+    if workers <= 1 or len(tasks) <= 1:
         for name, numbers in missing.items():
-            yield from _attempts(run, name, numbers, plans, make)
+            loaded = _load(run.robot, name, run.weights)
+            yield from (_attempted(run, loaded, name, number, plans, make) for number in numbers)
         return
     faults = list[Exception]()
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_all_attempts, run, *item, plans, make) for item in missing.items()]):
-            made, fault = future.result()
-            yield from made
-            faults += [] if fault is None else [fault]
-    if faults:  # once nothing of the others is lost
-        raise faults[0]
+    pool = ProcessPool(min(workers, len(tasks)), initializer=use_one_thread, initargs=(max(1, cores() // workers),),
+                       context=multiprocessing.get_context("spawn"))
+    try:
+        futures: list[Future[Attempt]] = [pool.schedule(_attempted_apart, task) for task in tasks]
+        for future in as_completed(futures):
+            try:
+                made = future.result()
+            except Exception as fault:  # the others are made and stored before it is told
+                faults.append(fault)
+            else:
+                yield made
+    finally:
+        pool.stop()
+        pool.join()
+    if faults:
+        raise _explained(faults[0], workers)
 
 
-def _all_attempts(*task: Any) -> tuple[list[Attempt], Exception | None]:
-    """Attempts with an object, and what ended them too early."""
-    made = list[Attempt]()
-    with one_thread():
-        try:
-            for one in _attempts(*task):
-                made.append(one)
-        except Exception as fault:
-            return made, fault
-    return made, None
+def _explained(fault: Exception, workers: int) -> Exception:
+    """A fault in words, where it is none of ours."""
+    if not isinstance(fault, ProcessExpired | BrokenProcessPool):
+        return fault
+    code = f" (exit code {fault.exitcode})" if isinstance(fault, ProcessExpired) else ""
+    return OptionError(f"one of {workers} processes died over its attempt{code}, perhaps for want of memory; ask for fewer "
+                       "(workers=...). The attempts that ended are stored, and the same run makes what is missing")
 
 
-def _attempts(
-    run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None, make: Callable[..., Attempt]
-) -> Iterator[Attempt]:
-    robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
-    weights = describe_weights(run.weights)["sha256"]
-    for number in numbers:
-        keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
-        made = make(robot, obj, number, run.seed, predictor, run.config, keeper)
-        yield replace(
-            made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
-            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights,
-            solid_sha256=obj.solid_sha256)
+Loaded = tuple[Robot, ObjectModel, GraspPredictor]  # What attempts with an object share
+
+
+def _load(robot: str, obj: str, weights: str | None) -> Loaded:
+    return load_robot(robot), load_object(obj), GraspPredictor(weights)
+
+
+_kept = lru_cache(maxsize=2)(_load)  # In a worker, whose attempts with an object mostly follow each other
+
+
+def _attempted_apart(run: TabletopRun, name: str, *others: Any) -> Attempt:
+    return _attempted(run, _kept(run.robot, name, run.weights), name, *others)
+
+
+def _attempted(
+    run: TabletopRun, loaded: Loaded, name: str, number: int, plans: Path | None, make: Callable[..., Attempt]
+) -> Attempt:
+    robot, obj, predictor = loaded
+    keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
+    return replace(
+        make(robot, obj, number, run.seed, predictor, run.config, keeper), robot_file=str(run.robot), object_file=str(name),
+        weights=str(run.weights or DEFAULT), robot_sha256=robot.sha256, object_sha256=obj.sha256,
+        weights_sha256=describe_weights(run.weights)["sha256"], solid_sha256=obj.solid_sha256)

@@ -9,14 +9,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import socket
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from functools import partial
-from multiprocessing import connection
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pebble import ProcessExpired, ProcessPool
@@ -24,8 +22,8 @@ from pebble import ProcessExpired, ProcessPool
 from dro_grasp.errors import ClusterError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.training.data.engine.shards import Failed, failure_of
-from dro_grasp.training.data.engine.threads import use_one_thread
 from dro_grasp.training.data.engine.worker import Job, make_shards
+from dro_grasp.workers import use_one_thread
 
 if TYPE_CHECKING:
     import ray
@@ -265,17 +263,9 @@ class RayTasks:
 
 
 def _join_alone() -> None:
-    """Prepare the process that joins a cluster: what Ray prints is no result, and it ends with the one that started it."""
+    """Prepare the process that joins a cluster: what Ray prints is no result."""
     use_one_thread()
     os.dup2(2, 1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end() -> None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=end, daemon=True).start()
 
 
 def _join(*arguments: Any) -> None:
