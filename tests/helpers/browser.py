@@ -8,9 +8,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, cast
 
 import pytest
 from playwright.sync_api import Page, sync_playwright
+from viser import GuiEvent
 
 HOST = "127.0.0.1"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -21,6 +23,15 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return probe.getsockname()[1]
+
+
+def use(control: Any, value: Any = None) -> None:
+    """Press a button, or change a control, as a browser does."""
+    if value is not None:
+        control.value = value
+    event = GuiEvent(client=cast(Any, object()), client_id=0, target=control)
+    for called in list(control._impl.update_cb):
+        called(event)
 
 
 @contextmanager

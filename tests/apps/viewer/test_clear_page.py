@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import dro_grasp as dro
 from dro_grasp.apps.viewer.clear_page import ClearPage, clear_page, now, picks
 from dro_grasp.arm.clearing.record import ClearRecord, Judgement, Look, Picked
 from dro_grasp.cli.view import View
-from tests.helpers.browser import free_port
+from tests.helpers.browser import free_port, use
 
 
 @pytest.fixture(scope="module")
@@ -65,16 +67,79 @@ def test_a_look_that_shows_nothing_and_a_part_that_is_picked(page: ClearPage) ->
     page.show_moment(19)
     assert page._look == 2
     assert page.server.scene.get_handle_by_name("/look") is None
-    page.part.value = list(page.starts)[2]
-    page._go()
-    assert page.moment.value == 9
-    assert "(lift)" in page.part.value
+    for _ in range(2):  # it can be chosen again
+        page.show_moment(0)
+        pick = list(page.starts)[2]
+        assert page.part.value != pick
+        use(page.part, pick)
+        assert "(lift)" in pick
+        assert page.moment.value == 9
 
 
-def test_playing_ends_at_the_last_moment(page: ClearPage) -> None:
+def test_playing_ends_at_the_last_moment_and_then_begins_anew(page: ClearPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, show = list[int](), page.show_moment
+    monkeypatch.setattr(page, "show_moment", lambda moment: (shown.append(moment), show(moment)))
     page.speed.value = "8 x"
-    page._guarded(page._play)
-    assert page.moment.value == 19
+    for _ in range(2):
+        page._guarded(page._play)
+        assert page.moment.value == 19
+    assert shown == 2 * [*range(20)]
+
+
+def played(page: ClearPage) -> threading.Thread:
+    """A thread that plays slowly, and has begun."""
+    page.speed.value = "1 x"
+    playing = threading.Thread(target=lambda: use(page.play))
+    playing.start()
+    while not page.moment.value:
+        time.sleep(0.01)
+    return playing
+
+
+def test_a_film_is_stopped_by_its_button_and_by_a_moment_that_is_chosen(page: ClearPage) -> None:
+    """It would go on for two seconds, and plays on from where it was stopped."""
+    playing = played(page)
+    use(page.play)
+    playing.join(0.5)
+    assert not playing.is_alive()
+    stopped = page.moment.value
+    assert 0 < stopped < 19
+    playing = threading.Thread(target=lambda: use(page.play))
+    playing.start()
+    time.sleep(0.05)
+    assert page.moment.value >= stopped
+    use(page.moment, 3)
+    playing.join(0.5)
+    assert not playing.is_alive()
+    np.testing.assert_allclose(page._things[0].position, page.record.poses[3, 0, :3, 3], atol=1e-6)
+
+
+def test_a_page_that_is_stopped_ends_its_film(record: ClearRecord, robot: dro.Robot) -> None:
+    page = ClearPage(record, robot, port=free_port())
+    playing = played(page)
+    page.stop()
+    playing.join(0.5)
+    assert not playing.is_alive()
+
+
+def test_no_picture_of_a_film_is_shown_once_there_is_another_one(page: ClearPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, drawing = list[object](), threading.Event()
+
+    def show(moment: int) -> None:
+        film = page.film
+        drawing.set()
+        time.sleep(0.05)
+        drawn.append(film)
+
+    monkeypatch.setattr(page, "show_moment", show)
+    before = page.film
+    playing = threading.Thread(target=lambda: page._guarded(page._play))
+    playing.start()
+    assert drawing.wait(5)
+    page.film = None
+    drawn.append(None)
+    playing.join(5)
+    assert drawn[-2:] == [before, None]
 
 
 def test_words_know_the_pick_that_goes_on(record: ClearRecord) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import threading
 import time
 from pathlib import Path
 
@@ -11,12 +12,15 @@ import numpy as np
 import pytest
 import torch
 
+from dro_grasp.apps.viewer import grasp_page as page_module
 from dro_grasp.apps.viewer.grasp_page import GraspViewer, describe, postures_of
 from dro_grasp.apps.viewer.scene_view import HOST, ServedPage, viewpoint
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.appearance import success_colour
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
@@ -88,6 +92,26 @@ def test_layers_are_shown_as_the_controls_say(viewer: GraspViewer) -> None:
     viewer.shapes.value, viewer.points.value, viewer.predicted.value = False, True, True
     assert (viewer.view.links[0].visible, viewer.view.solved.visible, viewer.view.predicted.visible) == (False, True, True)
     viewer.shapes.value, viewer.points.value, viewer.predicted.value = True, False, False
+
+
+def test_a_grasp_that_takes_long_is_not_drawn_over_a_later_one(viewer: GraspViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on, honest = threading.Event(), threading.Event(), page_module.postures_of
+
+    def slow(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> dict[str, torch.Tensor]:
+        if float(grasps.score[0]) > 0:  # the first
+            begun.set()
+            assert go_on.wait(20)
+        return honest(hand, obj, grasps)
+
+    viewer.show(1, "grasp")
+    monkeypatch.setattr(page_module, "postures_of", slow)
+    older = threading.Thread(target=lambda: setattr(viewer.slider, "value", 0))
+    older.start()
+    assert begun.wait(20)
+    viewer.slider.value = 1
+    go_on.set()
+    older.join(20)
+    assert "Grasp 1" in viewer.text.content
 
 
 def test_only_this_machine_is_served(viewer: GraspViewer) -> None:

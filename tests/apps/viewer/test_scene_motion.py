@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +27,7 @@ from dro_grasp.arm.planning.task import PlanConfig
 from dro_grasp.errors import ObjectError, OptionError, PlanError
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import Scene
-from tests.helpers.browser import free_port
+from tests.helpers.browser import free_port, use
 from tests.helpers.weights import untrained_weights
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
@@ -185,6 +187,55 @@ def test_the_place_may_be_typed_and_what_is_no_place_is_told(page: RobotScenePag
     page._guarded(page._choose_place)
     assert "grasps can lift it" in page.status.content
     assert page.client.scene.get_handle_by_name("/place") is None
+
+
+def test_a_place_counts_once_it_is_typed_and_nothing_of_it_is_dropped(
+    page: RobotScenePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page.pick(thing_at(page, 0.45, 0.0))
+    ranked, begun, go_on = list[str](), threading.Event(), threading.Event()
+
+    def rank() -> None:
+        ranked.append(page.place.value)
+        begun.set()
+        assert go_on.wait(20)
+
+    monkeypatch.setattr(page, "_choose_place", rank)
+    keys = [threading.Thread(target=lambda text=text: use(page.place, text)) for text in ("0.4 ", "0.4 -0", "0.4 -0.2")]
+    for key in keys:
+        key.start()
+        time.sleep(0.1)
+    assert begun.wait(20)
+    last = threading.Thread(target=lambda: use(page.place, "0.4 -0.25"))
+    last.start()
+    last.join(20)
+    go_on.set()
+    for key in keys:
+        key.join(20)
+    assert ranked == ["0.4 -0.2", "0.4 -0.25"]
+
+
+def test_a_motion_that_plays_is_over_before_the_robot_is_at_home_again(
+    page: RobotScenePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page.pick(thing_at(page, 0.45, 0.0))
+    page._guarded(lambda: page._plan(True))
+    placed, place = list[float](), page.robot_view.place
+
+    def watched(arm: np.ndarray, hand: np.ndarray) -> None:
+        place(arm, hand)
+        placed.append(float(np.abs(arm - page.robot.home).max()))
+
+    monkeypatch.setattr(page.robot_view, "place", watched)
+    monkeypatch.setattr(page.marks, "show", lambda *_: time.sleep(0.3))  # time for some pictures more
+    playing = threading.Thread(target=lambda: use(page.play))
+    playing.start()
+    while len(placed) < 5:
+        time.sleep(0.01)
+    page._show()
+    playing.join(20)
+    assert placed[-1] == 0.0
+    np.testing.assert_allclose(page.cloud.movable.position, 0.0)
 
 
 def test_the_best_that_works_is_looked_for_in_all_of_them_and_a_failure_is_told(

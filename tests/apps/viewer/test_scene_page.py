@@ -227,6 +227,25 @@ def test_another_scene_while_grasps_are_made(page: ScenePage, tmp_path: Path) ->
     assert "/tmp" not in page.status.content
 
 
+def test_an_upload_waits_however_long_and_a_mesh_leaves_all_as_it_is(page: ScenePage, tmp_path: Path) -> None:
+    page.pick(0)
+    offer, wish = page.offer, page._wish
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")
+    page._take_scene(UploadedFile("box.stl", (tmp_path / "box.stl").read_bytes()))
+    assert "**It did not work:**" in page.status.content
+    assert (page.offer, page._wish) == (offer, wish)
+    begun, go_on = threading.Event(), threading.Event()
+    work = threading.Thread(target=lambda: page._guarded(lambda: (begun.set(), go_on.wait(60))))
+    work.start()
+    assert begun.wait(20)
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.005), np.arange(-0.3, 0.3, 0.005))
+    np.save(tmp_path / "bare.npy", np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1))
+    page._take_scene(UploadedFile("bare.npy", (tmp_path / "bare.npy").read_bytes()))
+    go_on.set()
+    work.join(60)
+    assert page.cloud.scene.name == "bare.npy"
+
+
 def test_what_fails_is_told_and_a_click_tries_again(page: ScenePage) -> None:
     assert isinstance(page.predictor, Quick)
     page.predictor.fails = True

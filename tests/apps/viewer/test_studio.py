@@ -38,7 +38,7 @@ from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.predictor import GraspPredictor
-from tests.helpers.browser import free_port, page_of
+from tests.helpers.browser import free_port, page_of, use
 from tests.helpers.served_studio import served_studio, visited
 from tests.helpers.weights import untrained_weights
 
@@ -129,7 +129,7 @@ def test_a_trial_plays_and_ends_where_it_began(
         honest(joints, T, T_object)
 
     monkeypatch.setattr(studio.view, "show", show)
-    studio._guarded(studio._play)
+    use(studio.play)
     assert (studio.moment.max, studio.moment.disabled) == (len(seen) - 1, False)
     studio.show_moment(7)
     assert torch.equal(seen.pop(), seen[7]), "any moment can be seen again"
@@ -232,6 +232,45 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio) -> Non
     assert studio.hand.value == "gripper3"
     assert "late.urdf" in studio.hand.options
     assert "late.urdf is stored; pick it" in studio.status.content
+
+
+def test_what_is_picked_while_the_page_is_busy_is_shown_afterwards(studio: Studio) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    work = threading.Thread(target=lambda: studio._guarded(lambda: (begun.set(), go_on.wait(20))))
+    work.start()
+    assert begun.wait(20)
+    try:
+        for _ in range(2):
+            use(studio.object, "can")
+        use(studio.panel.table, "-0.05")
+        assert "Busy" in studio.status.content
+    finally:
+        go_on.set()
+    work.join(60)
+    assert studio.client.scene.get_handle_by_name("/constraints/table") is not None
+    use(studio.panel.table, "here")
+    assert "is 'here', which holds something else" in studio.status.content
+    studio.panel.table.value = ""
+    use(studio.object, "sphere")
+    assert "gripper3 above sphere" in studio.status.content
+
+
+def test_a_fault_is_told_as_well_as_raised(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    def faulty(*_: object) -> None:
+        studio._say("Generating ...")
+        raise ZeroDivisionError("an error of ours")
+
+    monkeypatch.setattr(studio.predictor, "run", faulty)
+    with pytest.raises(ZeroDivisionError):
+        use(studio.button)
+    assert "**Error:** ZeroDivisionError: an error of ours; this is a fault of dro-grasp" in studio.status.content
+    monkeypatch.undo()
+    use(studio.object, "sphere")
+    assert "Error" not in studio.status.content
+    monkeypatch.setattr(studio.library, "take", faulty)
+    with pytest.raises(ZeroDivisionError):
+        studio._take(viser.UploadedFile(name="a.urdf", content=b""), "hand", studio.hand, studio._preview)
+    assert "an error of ours" in studio.status.content
 
 
 def test_no_control_is_sent_before_all_are_connected(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:

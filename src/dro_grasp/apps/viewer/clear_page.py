@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
-from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
+from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, SharedPage, escaped, move, rgb
 from dro_grasp.arm.clearing.record import ClearRecord, Event, Judgement, Look, Picked
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
@@ -20,10 +20,11 @@ from dro_grasp.pictures.appearance import SOLVED_COLOUR
 SPEEDS = ("1 x", "2 x", "4 x", "8 x")  # How fast it can be played (ours)
 SEEN = 12_000  # Most points of a look that are drawn (ours)
 ABOVE = 0.008  # Points lower than this above the table are its own, and not drawn [m] (ours)
+ANYWHERE = "..."  # What the list of beginnings shows; each can be chosen again
 AT_START = "start"  # Choice of the beginning
 
 
-class ClearPage(ServedPage, Page):
+class ClearPage(SharedPage):
     """A running page; `stop()` ends it.
 
     Examples:
@@ -58,7 +59,7 @@ class ClearPage(ServedPage, Page):
         self.speed = gui.add_dropdown("Speed", SPEEDS, initial_value=SPEEDS[2])
         self.starts = {AT_START: 0} | {
             f"pick {i}: {outcome(pick)}": begin for i, (begin, pick) in enumerate(picks(record), 1)}
-        self.part = gui.add_dropdown("Go to", tuple(self.starts), initial_value=AT_START)
+        self.part = gui.add_dropdown("Go to", (ANYWHERE, *self.starts), initial_value=ANYWHERE)
         self.cloud = gui.add_checkbox("What the camera saw", True, hint="Above the table, at the last look before the moment.")
         self.text = self.status = gui.add_markdown("")
         with gui.add_folder("All that happened", expand_by_default=False):
@@ -76,9 +77,10 @@ class ClearPage(ServedPage, Page):
 
     def _go(self) -> None:
         """Show the beginning of what was picked."""
-        self.film = object()  # what plays stops
-        self.moment.value = moment = self.starts[self.part.value]
-        self.show_moment(moment)
+        if (moment := self.starts.get(self.part.value)) is not None:
+            self._seek(moment)
+            self.moment.value = moment
+        self.part.value = ANYWHERE
 
     def show_moment(self, moment: int) -> None:
         """Show one moment of the run."""
@@ -109,11 +111,8 @@ class ClearPage(ServedPage, Page):
                               point_shape="circle", precision="float32")
 
     def _play(self) -> None:
-        """Play from the moment that is shown, or from the start where that is the last one."""
         record, fast = self.record, float(self.speed.value.split()[0])
-        first = int(self.moment.value) if int(self.moment.value) < len(record.arm) - 1 else 0
-        self.film = film = object()
-        self._roll(film, len(record.arm), 1 / (record.rate * fast), first)
+        self._roll(record, len(record.arm), 1 / (record.rate * fast))
 
 
 def clear_page(

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.apps.viewer.constraint_panel import ANY
-from dro_grasp.apps.viewer.scene_view import HOST, Client, Page, ServedPage, escaped, serve
+from dro_grasp.apps.viewer.scene_view import HOST, Client, Page, ServedPage, SharedPage, escaped, serve
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
@@ -66,7 +66,6 @@ class GraspPage(Page):
         super().__init__(client)
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
-        self.film: Film | None = None
         with client.atomic():  # the browser gets no control before all are connected
             self._add_choices()
             self.status = client.gui.add_markdown("")
@@ -140,14 +139,16 @@ class GraspPage(Page):
         index = self._picked()
         if self.made is None or index is None:
             return
-        hand, obj, grasps = self.made.hand, self.made.obj, self._batch()
-        grasp, posture = grasps[index], self.posture.value
+        hand, obj, grasps, posture = self.made.hand, self.made.obj, self._batch(), self.posture.value
+        grasp = grasps[index]
         if posture == "held":
             grasp = after_closing(hand, obj, grasp) if shows_held(hand, None) else grasp
             joints = grasp.joints[0].float()
         else:
             joints = postures_of(hand, obj, grasp)[posture][0]
         T = grasp.T_object_wrist[0].float()
+        if self.made is None or self._picked() != index or self._batch() is not grasps or self.posture.value != posture:
+            return  # something else was chosen meanwhile, which is shown
         self._forget_film()
         with self.client.atomic():
             self.view.show(joints, T)
@@ -169,12 +170,12 @@ class GraspPage(Page):
             return
         grasps, protocol = self._batch(), self.made.protocol
         self._say(f"Playing the trial under *{escaped(protocol)}*.")
-        film = Film(grasps.T_object_wrist[index].float(), *record(self.made.hand, self.made.obj, grasps, index, protocol))
-        last = len(film.poses) - 1
-        self.film, self.moment.max, self.moment.disabled = film, last, False
-        if self._picked() != index:  # while it was recorded
-            self._forget_film()
-        if self._roll(film, last + 1, self.frame_seconds):
+        if (film := self.film) is None:
+            film = Film(grasps.T_object_wrist[index].float(), *record(self.made.hand, self.made.obj, grasps, index, protocol))
+            self.film, self.moment.max, self.moment.disabled = film, len(film.poses) - 1, False
+            if self._picked() != index:  # while it was recorded
+                self._forget_film()
+        if self._roll(film, len(film.poses), self.frame_seconds):
             self._say("Played. Move *Moment* to see any moment again.")
         else:
             self._say("Stopped: something else was picked.")
@@ -223,7 +224,7 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     return keep
 
 
-class GraspViewer(ServedPage, GraspPage):
+class GraspViewer(SharedPage, GraspPage):
     """The page of given grasps, served; `stop()` ends it.
 
     Examples:

@@ -12,7 +12,7 @@ import viser
 
 from dro_grasp.apps.viewer.film import RATE, Film
 from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
-from dro_grasp.apps.viewer.scene_view import HOST, PATIENCE, POINT_SIZE, Page, ServedPage, escaped, move, rgb
+from dro_grasp.apps.viewer.scene_view import HOST, PATIENCE, POINT_SIZE, Page, ServedPage, SharedPage, escaped, move, rgb
 from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
@@ -34,7 +34,7 @@ NONE = "none"  # Choice of no grasps
 EVERY = "all"  # Choice of every grasp
 
 
-class LiftPage(ServedPage, Page):
+class LiftPage(SharedPage):
     """A running page; `stop()` ends it.
 
     Examples:
@@ -56,7 +56,6 @@ class LiftPage(ServedPage, Page):
         self.robot, self.attempts, self.weights, self.make = robot, list(attempts), weights, make
         ServedPage.__init__(self, port, host, token)
         Page.__init__(self, self.server)
-        self.film: Film | None = None
         self.arm_view = RobotView(self.server)
         self._sign = HoldSign(self.arm_view)
         self._add_controls()
@@ -148,7 +147,8 @@ class LiftPage(ServedPage, Page):
             self.grasps.options = (NONE, EVERY, *dict.fromkeys(film.plan.scene.fate))
             said += map(escaped, film.plan.lines())
         self._said = "  \n".join(filter(None, said))
-        self.moment.max, self.moment.disabled, self.play.disabled = len(film.arm) - 1, False, False
+        self.moment.max, self.moment.value = len(film.arm) - 1, 0
+        self.moment.disabled = self.play.disabled = False
         self._aim()
         self._show_layers()
         self.show_moment(0)

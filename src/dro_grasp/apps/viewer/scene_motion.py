@@ -6,6 +6,7 @@ import itertools
 import math
 import tempfile
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +42,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 PLACE_COLOUR: Colour = (0.30, 0.65, 0.42)  # Green of where the thing will stand
 NEAR = 0.15  # Margin of the thing in the view of its grasps [m] (ours)
 TABLE_WITHIN = 0.05  # Farthest that the plane below a thing may be from the robot's table to be it [m] (ours)
+TYPING = 0.5  # Pause after which what was typed is taken to be whole [s] (ours)
 SEEDS = 4  # How often the motion of one grasp is tried (ours)
 ON_PLANE = 0.02  # Points nearer to a plane than this are its own [m] (ours)
 
@@ -71,7 +73,7 @@ class RobotScenePage(ScenePage):
             self.any = gui.add_button("Plan the best that works", disabled=True)
             self._add_player("Play")
             self.words = gui.add_markdown("")
-        self.place.on_update(lambda event: None if event.client is None else self._guarded(self._choose_place))
+        self.place.on_update(lambda event: None if event.client is None else self._typed())
         self.one.on_click(lambda _: self._guarded(lambda: self._plan(True)))
         self.any.on_click(lambda _: self._guarded(lambda: self._plan(False)))
 
@@ -101,7 +103,14 @@ class RobotScenePage(ScenePage):
         if self.offer is None:
             self._tell(f"It will be put at {point[0]:.2f} {point[1]:.2f} m, once there are grasps.")
             return
-        self._guarded(self._choose_place)
+        self._afterwards(self._choose_place)
+
+    def _typed(self) -> None:
+        """Something was typed into the field of the place; it counts once the typing pauses."""
+        text = self.place.value
+        time.sleep(TYPING)
+        if self.place.value == text:
+            self._afterwards(self._choose_place)
 
     def _numbers(self) -> tuple[float, ...] | None:
         """The numbers in the field of the place, if that is what it holds."""
@@ -261,14 +270,14 @@ class RobotScenePage(ScenePage):
         if index is not None:
             self.grasp.value = self.grasp.options[index]
             self._show()
-        self.made, self.film = made, Film.of_plan(self.robot, made)
+        self.made, self.film = made, (film := Film.of_plan(self.robot, made))
         if self.offer is not None and made.notes.place is not None:  # it may have been turned
             self._draw_there(self.offer, np.array(made.notes.place))
         self.hand_view.hide()
         self.marks.hide()
-        self.moment.max, self.moment.value = len(self.film.arm) - 1, 0
+        self.moment.max, self.moment.value = len(film.arm) - 1, 0
         self.moment.disabled = self.play.disabled = self.save.disabled = False
-        self.view.aim(Camera.around(self.robot_view.swept(self.film.arm, self.film.hand), VIEW, aspect=4 / 3))
+        self.view.aim(Camera.around(self.robot_view.swept(film.arm, film.hand), VIEW, aspect=4 / 3))
         self.show_moment(0)
         put = "" if made.notes.place is None else " It ends with the thing on its place."
         self._say(f"**The motion of {made.seconds:.0f} s is planned.**{put} Press *Play*, or move *Moment*.")
@@ -294,12 +303,12 @@ class RobotScenePage(ScenePage):
 
     def _forget_film(self) -> None:
         """The robot is at home, and the thing where it was seen."""
-        if self.film is not None:
+        before, self.made, self.film = self.film, None, None
+        if before is not None:
             move(self.cloud.movable, np.eye(4))
             self.robot_view.place(self.robot.home, self.robot.hand.canonical_joints().double().numpy())
             if self.offer is not None:
                 self.marks.show(self.hand, self.offer.grasps, [not fault for fault in self.offer.faults])
-        self.made = self.film = None
         self.moment.disabled = self.play.disabled = self.save.disabled = True
         self.words.content = ""
 

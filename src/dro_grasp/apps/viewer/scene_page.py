@@ -19,7 +19,7 @@ from dro_grasp.apps.viewer.constraint_panel import OBJECT_FILES
 from dro_grasp.apps.viewer.grasp_page import GRASP_FILE, exported
 from dro_grasp.apps.viewer.hand_view import GraspMarks, HandView, colour_of
 from dro_grasp.apps.viewer.scene_cloud import LEGEND, SceneCloud
-from dro_grasp.apps.viewer.scene_view import PATIENCE, Client, Closed, Page, escaped, rgb
+from dro_grasp.apps.viewer.scene_view import Client, Closed, Page, escaped, rgb
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.grasps.batch import GraspBatch
@@ -394,15 +394,12 @@ class ScenePage(Page):
 
     def _take_scene(self, upload: viser.UploadedFile) -> None:
         """Open an uploaded scene; what is made for the one before is given up."""
-        with suppress(Closed):
-            try:
-                label = self.library.take(upload.name, upload.content, "scene")
-                scene = load_scene(self.library.own["scene"][label], label, camera=self._camera)
-            except DroGraspError as error:
-                self._complain(error)
-                return
+        with suppress(Closed), self._telling():
+            label = self.library.take(upload.name, upload.content, "scene")
+            scene = load_scene(self.library.own["scene"][label], label, camera=self._camera)
+            self._say(f"{escaped(label)} shows {scene.segments.count} things; it is next.")
             self._wish = None
-            self._guarded(lambda: self.open(scene), PATIENCE)
+            self._afterwards(lambda: self.open(scene))
 
     def _send(self, event: viser.GuiEvent) -> None:
         """Send the grasps to the browser."""

@@ -48,6 +48,7 @@ RAISED = 0.27  # Share of its height by which hand and object then stand above t
 PATIENCE = 10.0  # Longest time in which work ends that is given up [s] (ours)
 CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does [s] (ours)
 TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still wanted [s] (ours)
+STOP_TIME = 0.3  # Time that a film which was stopped has to end, before it plays on [s] (ours)
 GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 
 Point = tuple[float, float, float]  # A place [m]
@@ -279,10 +280,26 @@ class Page(ABC):
     status: viser.GuiMarkdownHandle  # What the page does, and errors; whoever inherits adds it
 
     def __init__(self, client: Client) -> None:
-        self.client, self.view, self.film = client, SceneView(client), None
+        self.client, self.view = client, SceneView(client)
         self.closed = threading.Event()
         """Whether nobody sees the page any more."""
         self._busy = threading.Lock()
+        self._later: list[Callable[[], None]] = []
+        """What was asked for while the page was busy."""
+        self._film: Any = None
+        self._plays = False
+        self._picture = threading.RLock()
+        """Held while a picture of the film is shown."""
+
+    @property
+    def film(self) -> Any:
+        """What can be played, None for nothing; once there is another one, no picture of the one before is shown any more."""
+        return self._film
+
+    @film.setter
+    def film(self, film: Any) -> None:
+        with self._picture:
+            self._film, self._plays = film, False
 
     def close(self) -> None:
         """End what the page does."""
@@ -300,21 +317,44 @@ class Page(ABC):
     def _add_player(self, label: str) -> None:
         """Add the controls of the film, disabled at first."""
         gui = self.client.gui
-        self.play = gui.add_button(label, disabled=True)
+        self.play = gui.add_button(label, disabled=True, hint="From the moment that is shown; stops what plays.")
         self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True, hint="Of what was played.")
-        self.play.on_click(lambda _: self._guarded(self._play))
-        self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
+        self.play.on_click(lambda _: self._play_or_stop())
+        self.moment.on_update(lambda event: None if event.client is None else self._seek(int(self.moment.value)))
 
-    def _roll(self, film: Any, moments: int, interval: float, first: int = 0) -> bool:
-        """Show a film picture by picture from the first on, each for an interval [s]; False if another took its place."""
-        for moment in range(first, moments):
-            begin = time.monotonic()
-            if self.film is not film:
-                return False
+    def _play_or_stop(self) -> None:
+        """Stop the film if it plays, and play it otherwise."""
+        with self._picture:
+            plays, self._plays = self._plays, False
+        if not plays:
+            self._guarded(self._play, STOP_TIME)
+
+    def _seek(self, moment: int) -> None:
+        """Stop the film, and show one picture of it."""
+        with self._picture:
+            self._plays = False
             self.show_moment(moment)
-            self.moment.value = moment
+
+    def _roll(self, film: Any, moments: int, interval: float) -> bool:
+        """Show a film picture by picture, each for an interval [s], until it is stopped; False if another took its place.
+
+        It begins at the moment that is shown, or at the first where that is the last one.
+        """
+        with self._picture:
+            first, self._plays = int(self.moment.value), self.film is film
+        for moment in range(first if first < moments - 1 else 0, moments):
+            begin = time.monotonic()
+            if self.closed.is_set():
+                raise Closed
+            with self._picture:
+                if not self._plays:
+                    break
+                self.show_moment(moment)
+                self.moment.value = moment
             time.sleep(max(0.0, interval - (time.monotonic() - begin)))
-        return True
+        with self._picture:
+            self._plays = False
+            return self.film is film
 
     def _guarded(self, work: Callable[[], None], patience: float = 0.0, otherwise: str = "Busy; wait a moment.") -> None:
         """Do one thing at a time, and show errors on the page; `otherwise` is said if other work outlasts the patience [s]."""
@@ -323,11 +363,36 @@ class Page(ABC):
                 self._say(otherwise)
                 return
             try:
-                work()
-            except DroGraspError as error:
-                self._complain(error)
+                with self._telling():
+                    work()
             finally:
                 self._busy.release()
+            if self._later:
+                self._guarded(self._catch_up)
+
+    def _afterwards(self, work: Callable[[], None]) -> None:
+        """Do something at once, or when what goes on has ended; once, however often it is asked for meanwhile."""
+        if work not in self._later:
+            self._later.append(work)
+        self._guarded(self._catch_up, otherwise="Busy; it is next.")
+
+    def _catch_up(self) -> None:
+        """Do what was asked for meanwhile."""
+        while self._later:
+            self._later.pop(0)()
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Show errors on the page, where a fault of ours would look like work that never ends; that is raised as well."""
+        try:
+            yield
+        except DroGraspError as error:
+            self._complain(error)
+        except Closed:
+            raise
+        except Exception as error:
+            self._say(f"**Error:** {escaped(f'{type(error).__name__}: {error}')}; this is a fault of dro-grasp")
+            raise
 
     @contextlib.contextmanager
     def _when_it_is(self, turn: threading.Lock, still: Callable[[], None] = lambda: None) -> Iterator[None]:
@@ -388,6 +453,15 @@ class ServedPage:
     def stop(self) -> None:
         """Stop serving and free the port."""
         self.server.stop()
+
+
+class SharedPage(ServedPage, Page):
+    """A page that is the same in all browsers; `stop()` ends it."""
+
+    def stop(self) -> None:
+        """End what the page does, stop serving, and free the port."""
+        self.close()
+        super().stop()
 
 
 def serve(page: ServedPage) -> None:

@@ -158,14 +158,14 @@ class Studio(GraspPage):
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
-        self.panel = panel = ConstraintPanel(self.client, lambda: self._guarded(self._draw_constraints))
+        self.panel = panel = ConstraintPanel(self.client, lambda: self._afterwards(self._draw_constraints))
         hand_file.on_upload(lambda _: self._take(hand_file.value, "hand", self.hand, self._preview))
         object_file.on_upload(lambda _: self._take(object_file.value, "object", self.object, self._preview))
         panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.obstacles, self._draw_constraints))
         panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
         for choice in (self.hand, self.object):
-            choice.on_update(lambda event: None if event.client is None else self._guarded(self._pick_object))
+            choice.on_update(lambda event: None if event.client is None else self._afterwards(self._pick_object))
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
     def _take(
@@ -176,14 +176,10 @@ class Studio(GraspPage):
 
         Where other work, such as loading the first pair, outlasts the patience [s] (ours), it can be picked later.
         """
-        with suppress(Closed):
+        with suppress(Closed), self._telling():
             if self.closed.is_set():
                 return
-            try:
-                label = self.library.take(upload.name, upload.content, kind)
-            except DroGraspError as error:
-                self._complain(error)
-                return
+            label = self.library.take(upload.name, upload.content, kind)
             if kind == "object":
                 self._batches.pop(label, None)
             choice.options = tuple(dict.fromkeys([*choice.options, label]))
