@@ -19,9 +19,10 @@ from dro_grasp.compare.metrics import difference_interval
 from dro_grasp.compare.rows import Row
 from dro_grasp.compare.stages import BEST, RAW, REFINED, RETURNED, BenchmarkConfig, benchmark
 from dro_grasp.devices import require_device
-from dro_grasp.errors import BundleError, OptionError
+from dro_grasp.errors import BundleError, NoGraspError, OptionError
 from dro_grasp.files import check_folder, command, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
+from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import Checked, flat
 from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
@@ -367,22 +368,27 @@ def _rates(done: Onboarded) -> str:
 
 
 def _drawn(done: Onboarded) -> str:
-    config, asked = done.config, done.config.grasps_drawn
+    config = done.config
     hand, predictor = load_hand(done.hand), GraspPredictor(done.weights, config.device, config.predictor)
     parts = []
     for name in resolve_objects(list(config.held_out))[: config.objects_drawn]:
-        obj = load_object(name)
-        path = done.folder / f"{Path(name).stem}.png"
-        problem = GraspProblem(hand, obj, predictor.device)
-        made = predictor.run(problem, GraspRequest(asked, source=config.source))
-        draw_grasps(hand, obj, evaluate(problem, made.grasps), path)
-        by_optimiser, short = made.origin.count("optimiser"), ""
-        if len(made.grasps) < asked:
-            short = f"; {len(made.grasps)} of the {asked} asked for were found"
-        parts.append(image(path.read_bytes(), f"grasps of {name}")
-                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}"
-                       "</p>")
+        try:
+            parts.append(_drawn_on(name, done, hand, predictor))
+        except NoGraspError as error:
+            parts.append(f"<p class=note>{html.escape(name)}: none was found: {html.escape(str(error))}</p>")
     return "".join(parts)
+
+
+def _drawn_on(name: str, done: Onboarded, hand: Hand, predictor: GraspPredictor) -> str:
+    obj, path, asked = load_object(name), done.folder / f"{Path(name).stem}.png", done.config.grasps_drawn
+    problem = GraspProblem(hand, obj, predictor.device)
+    made = predictor.run(problem, GraspRequest(asked, source=done.config.source))
+    draw_grasps(hand, obj, evaluate(problem, made.grasps), path)
+    by_optimiser, short = made.origin.count("optimiser"), ""
+    if len(made.grasps) < asked:
+        short = f"; {len(made.grasps)} of the {asked} asked for were found"
+    return (image(path.read_bytes(), f"grasps of {name}")
+            + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}</p>")
 
 
 def _data(step: dict[str, Any]) -> str:
