@@ -48,6 +48,12 @@ def checked(call: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     return checking
 
 
+def require_seed(seed: int, bits: int = 63) -> None:
+    """Refuse a seed of random numbers that does not fit into so many bits, or is negative: OptionError."""
+    if not 0 <= seed < 2**bits:
+        raise OptionError(f"seed is {seed}; give an integer from 0 to 2^{bits} - 1")
+
+
 def plain(name: str, given: Any, kind: Any) -> Any:
     """A value as Python's own of its kind, of WORDS, a choice, or a tuple of these; an OptionError if it is of another."""
     for each in _members(kind):

@@ -12,6 +12,7 @@ from dro_grasp.cli.output import print_json, print_table, say, say_aside, say_fi
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import UNTYPED, check_output, reading, replacing
+from dro_grasp.kinds import require_seed
 
 if TYPE_CHECKING:
     from dro_grasp.arm.clearing.loop import Pick
@@ -73,8 +74,7 @@ class Clear:
             check_output(self.output, ".jsonl")
         if self.record is not None:
             check_output(self.record, ".npz")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
+        require_seed(self.seed, 31)
         names = resolve_objects(list(self.objects))
         count = len(names) if self.things is None else self.things
         if self.tables < 1 or not 1 <= count <= len(names):

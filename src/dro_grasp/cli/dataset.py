@@ -187,12 +187,23 @@ class DataSets:
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
 
-    def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
+    def given(self, output: Path | None = None) -> tuple[Path, ...]:
+        """The data sets; refuses none at all, and a folder to write into that holds one."""
+        from dro_grasp.training.data.collections.collection import require_apart
+
+        if not self.inputs:
+            raise OptionError("no data set was given; name a folder or a grasp file at least")
+        if output is not None:
+            require_apart(self.inputs, output)
+        return self.inputs
+
+    def pairs(self, only_successful: bool, output: Path | None = None) -> Iterator[PairGrasps]:
         """The grasps of each pair in them; refuses two hands of one name, which cannot join in one file or table."""
         from dro_grasp.training.data.collections.collection import read_collection
         from dro_grasp.training.data.collections.coverage import of_one_version
 
-        return of_one_version((path, pair) for path in self.inputs for pair in read_collection(path, only_successful))
+        given = self.given(output)
+        return of_one_version((path, pair) for path in given for pair in read_collection(path, only_successful))
 
 
 @dataclass(frozen=True)
@@ -240,15 +251,26 @@ class Merge(DataSets):
 
     def run(self) -> int:
         """Merge, and write the files."""
-        from dro_grasp.training.data.collections.merging import file_name, merge, require_choice
+        from dro_grasp.training.data.collections.merging import (
+            file_name,
+            merge,
+            remove_further,
+            require_choice,
+            require_no_shards,
+        )
 
         require_choice(self.per_pair)
+        given = self.given(self.output)
+        require_no_shards(self.output)
         folder = make_folder(self.output)
-        rows = []
-        for merged in merge(self.inputs, self.per_pair, folder):
+        rows, last = [], {}
+        for merged in merge(given, self.per_pair, folder):
             path = folder / file_name(merged.hand, merged.number)
             merged.save(path)
+            last[merged.hand] = merged.number
             rows.append([merged.hand, len(merged), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
+        for hand, number in last.items():
+            remove_further(folder, hand, number)
         columns = ["hand", "grasps", "duplicates", "surplus", "bytes", "file"]
         values, total = {"output": str(folder), "files": records(columns, rows)}, sum(row[1] for row in rows)
         print_result(self.json, values, f"merged into {folder}", columns, rows, f"{total} grasps in all")
@@ -322,7 +344,7 @@ class Filter(DataSets):
         config = FilterConfig(rules, self.resettle, self.again, self.close_fingers)
         with progress_bar("evaluating", self.json) as progress:
             report = filter_dataset(
-                self.pairs(only_successful=False), self.output, config, self.workers, progress, say_aside)
+                self.pairs(only_successful=False, output=self.output), self.output, config, self.workers, progress, say_aside)
         columns, total = ["hand", "object", "grasps", "kept"], sum(kept.grasps for kept in report.pairs)
         rows, passed = [[k.hand, k.object, k.grasps, k.kept] for k in report.pairs], sum(kept.kept for kept in report.pairs)
         label = ", ".join(each.label for each in rules)
@@ -365,7 +387,7 @@ class BundleCommand(DataSets):
 
         output = check_output(self.output, ".safetensors")
         further = [load_hand(name) for name in self.hands_without_grasps]
-        bundle, left_out = make_bundle(self.inputs, output, self.split, self.hands, self.per_pair, further)
+        bundle, left_out = make_bundle(self.given(), output, self.split, self.hands, self.per_pair, further)
         if left_out:
             say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
         report = {"output": str(output), "bytes": output.stat().st_size, **bundle.summary()}

@@ -15,6 +15,7 @@ from dro_grasp.cli.output import print_json, print_report, print_result, print_t
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, given_path, replacing
+from dro_grasp.kinds import require_seed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -106,8 +107,7 @@ class Plan:
         from dro_grasp.predict.predictor import GraspPredictor
 
         require_extra("arm")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
+        require_seed(self.seed, 31)
         self.check_scene()
         constraints = self.constraints.constraints(
             obstacles=None if self.surroundings is None else load_scene(self.surroundings))

@@ -18,7 +18,7 @@ from dro_grasp.devices import one_thread
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, require_seed
 from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel, with_mass
 from dro_grasp.predict.constraints import Constraints
@@ -66,6 +66,11 @@ class BenchmarkConfig(Checked):
     mass: float | None = None  # Mass of every object [kg]; its own by default
     constraints: Constraints = field(default_factory=Constraints)  # What grasps have to respect
     contact_quality: bool = False  # Whether contacts are measured too, as DexGraspBench does
+
+    def __post_init__(self) -> None:
+        """Refuse seeds out of range: OptionError."""
+        super().__post_init__()
+        require_seed(self.seed, 62)  # those of pairs are larger
 
 
 def benchmark(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dro_grasp.errors import OptionError
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, require_seed
 from dro_grasp.predict.finish import FinishConfig, check_confidence
 from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
@@ -51,8 +51,7 @@ class GraspRequest(Checked):
         if self.num * self.candidates > LARGEST_CALL:
             raise OptionError(f"{self.num} grasps of {self.candidates} candidates each do not fit memory; predict at most "
                               f"{LARGEST_CALL} at once, with another seed for more (seed=1)")
-        if not 0 <= self.seed < 2**63:
-            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
+        require_seed(self.seed)
         check_temperature(self.temperature)
         check_confidence(self.least_confidence or 0.0)
         if isinstance(self.source, str):

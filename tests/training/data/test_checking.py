@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
+from dro_grasp.compare.stages import BenchmarkConfig
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.protocols import changed
@@ -15,6 +16,7 @@ from dro_grasp.training.data.collections import checking, collection, filtering
 from dro_grasp.training.data.collections.checking import check, stored_protocol
 from dro_grasp.training.data.collections.collection import read_collection
 from dro_grasp.training.data.collections.filtering import FilterConfig, filter_dataset
+from dro_grasp.training.onboarding import OnboardingConfig
 
 
 def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
@@ -56,6 +58,24 @@ def test_a_sample_is_a_sample_and_repeats(stored):
         check(pairs, 0, changed("dro"))
     with pytest.raises(GraspFileError, match="nothing to check"):
         check([], 5, changed("dro"))
+
+
+def test_grasps_without_a_trial_are_no_failures(stored, tmp_path):
+    grasps = GraspBatch.load(stored)
+    GraspBatch.concatenate([grasps[:4], grasps[4:].without_trial()]).save(tmp_path / "some.parquet")
+    found = check(read_collection(tmp_path / "some.parquet", only_successful=False), 1000, changed("dro"))
+    assert found.evaluated == found.agreed == 4
+    grasps.without_trial().save(tmp_path / "none.parquet")
+    with pytest.raises(GraspFileError, match=r"no grasp that has had a trial; there is .*`dro-grasp evaluate`"):
+        check(read_collection(tmp_path / "none.parquet", only_successful=False), 5, changed("dro"))
+
+
+@pytest.mark.parametrize("seed", [-1, 10**20])
+def test_seeds_out_of_range_are_refused(stored, seed):
+    for wrong in (lambda: check(read_collection(stored), 1, changed("dro"), seed), lambda: BenchmarkConfig(seed=seed),
+                  lambda: OnboardingConfig(seed=seed)):
+        with pytest.raises(OptionError, match=f"seed is {seed}; give an integer from 0"):
+            wrong()
 
 
 def test_heavier_objects_and_slippery_hands_are_harder(stored):

@@ -251,8 +251,10 @@ def test_folders_of_other_settings_or_commands_are_refused(stored, tmp_path):
     other = tmp_path / "made"
     other.mkdir()
     Shard("a", "x", 0).save(stored.read_bytes(), other)
-    with pytest.raises(OptionError, match="holds grasps of `dro-grasp synthesize`"):
+    with pytest.raises(OptionError, match="holds grasps of another command"):
         filter_dataset(pairs, other, FilterConfig((changed("dro"),)))
+    with pytest.raises(OptionError, match="holds grasps of another command"):
+        filter_dataset(pairs, stored.parent, FilterConfig((changed("dro"),)))
     with pytest.raises(OptionError, match="name one at least"):
         FilterConfig(())
     with pytest.raises(OptionError, match="resettle=True"):

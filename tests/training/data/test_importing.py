@@ -151,6 +151,16 @@ def test_other_joints_are_told(made, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--hands" in capsys.readouterr().err
 
 
+def test_names_of_hands_that_are_in_no_file_are_refused(made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    position, angles, joints = made
+    q = torch.from_numpy(np.concatenate([position, angles, joints], 1)).float()
+    torch.save({"metadata": [(row, "can", HAND) for row in q]}, tmp_path / "theirs.pt")
+    named = ("--hands", "griper3=barrett", "--output", tmp_path / "out")
+    assert imported(tmp_path / "theirs.pt", "--format", "cmap", *named) == 2
+    assert f"no grasp is of a hand called griper3; the hands in the files are {HAND} (--hands)" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["dataset", "import", "--format", "cmap", "--output", str(out)]) == 2

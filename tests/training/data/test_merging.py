@@ -113,6 +113,42 @@ def test_a_hand_in_a_file_is_found_although_its_first_object_has_no_grasp(hand, 
     assert set(merged.yields) == {"can", "sphere"}
 
 
+@pytest.mark.parametrize("command", ["merge", "filter"])
+def test_what_is_read_is_not_written_over(folders, hand, tmp_path, capsys, command):
+    file = tmp_path / "own" / "gripper3.parquet"
+    file.parent.mkdir()
+    tried(hand, "sphere", 3, seed=0).save(file)
+    for given, output in ((file, file.parent), (file.parent, file.parent), (folders[0], folders[0])):
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        assert main(["dataset", command, str(given), "--output", str(output)]) == 2
+        assert f"{given} would be replaced by, or mixed with, what is made of it" in capsys.readouterr().err
+        assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_grasps_of_other_commands_stay_beside_no_others(folders, hand, tmp_path, capsys):
+    tried(hand, "sphere", 3, seed=0).save(tmp_path / "gripper3.parquet")
+    assert main(["dataset", "merge", str(tmp_path / "gripper3.parquet"), "--output", str(folders[0])]) == 2
+    assert f"{folders[0]} holds grasps of another command" in capsys.readouterr().err
+
+
+def test_a_second_merge_leaves_nothing_of_the_first(folders, hand, tmp_path):
+    (tmp_path / "out").mkdir()
+    for number in (2, 3):
+        tried(hand, "can", 3, seed=9).save(tmp_path / "out" / file_name(hand.name, number))
+    other = tmp_path / "out" / "gripper3.best.parquet"
+    tried(hand, "can", 3, seed=9).save(other)
+    assert main(["dataset", "merge", str(folders[0]), "--output", str(tmp_path / "out")]) == 0
+    assert set((tmp_path / "out").iterdir()) == {other, tmp_path / "out" / "gripper3.parquet"}
+
+
+@pytest.mark.parametrize("command", ["merge", "filter", "report", "check", "bundle"])
+def test_no_data_set_at_all_is_refused(tmp_path, capsys, command):
+    output = {"merge": "out", "filter": "out", "bundle": "out.safetensors"}
+    assert main(["dataset", command, *(["--output", str(tmp_path / output[command])] if command in output else [])]) == 2
+    assert "no data set was given" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_to_merge_is_told(hand, tmp_path, capsys):
     tried(hand, "can", 2, seed=0)[[]].save(tmp_path / "none.parquet")
     out = ["--output", str(tmp_path / "out")]

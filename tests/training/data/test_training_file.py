@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from dro_grasp.cli.main import main
-from dro_grasp.errors import BundleError, GraspFileError, OutputError
+from dro_grasp.errors import BundleError, GraspFileError, OptionError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
@@ -333,6 +333,9 @@ def test_what_cannot_be_bundled_is_counted_by_split(tmp_path: Path, capsys: pyte
     assert "objects for training" in told
     assert "choose --split" not in told
     assert "no grasps of other were given, but of toy" in refused("--hands", "other")
+    assert "no grasps of other were given, but of toy; name one of these with --hands" in refused("--hands", "toy", "other")
+    with pytest.raises(OptionError, match="split is 'test'; choose train, few_shot, validate"):
+        make_bundle([tmp_path / "mug.parquet"], tmp_path / "b.safetensors", split="test")
     held.replace(split=("validate", "validate", "test")).save(tmp_path / "mug.parquet")
     told = refused()
     assert "but 1 of split 'test', 2 of split 'validate'; choose --split validate, or" in told

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
-from dro_grasp.errors import BundleError
+from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
@@ -35,12 +35,14 @@ def make_bundle(
         without_grasps: As in `write_bundle`.
 
     Raises:
-        OptionError: `per_pair` is less than 1.
+        OptionError: `per_pair` is less than 1, there is no such split, or no grasp of one of `hands`.
         BundleError: It cannot be made of these grasps.
         GraspFileError: A file is damaged, or a hand or an object has changed since.
         OutputError: It cannot be written.
     """
     require_choice(per_pair)
+    if split not in SPLITS:
+        raise OptionError(f"split is '{split}'; choose {', '.join(SPLITS)}")
     allowed, kept, left_out = SPLITS[split], [], 0
     seen: Counter[str] = Counter()
     hands_seen: set[str] = set()
@@ -53,8 +55,11 @@ def make_bundle(
         left_out += len(pair.grasps) - len(grasps)
         if len(grasps):
             kept.append(grasps)
+    if unknown := [name for name in hands if name not in hands_seen]:
+        raise OptionError(f"no grasps of {', '.join(unknown)} were given, but of {', '.join(sorted(hands_seen))}; name one of "
+                          "these with hands=..., or leave it out")
     if not kept:
-        raise BundleError(_why_none(split, seen, hands, hands_seen))
+        raise BundleError(_why_none(split, seen))
     found, clouds, kept = sources(kept)
     if per_pair is not None:
         by_hash = {hand.sha256: hand for hand in found}
@@ -62,12 +67,9 @@ def make_bundle(
     return write_bundle(output, found, clouds, kept, allowed, without_grasps), left_out
 
 
-def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: Set[str]) -> str:
+def _why_none(split: str, seen: Counter[str]) -> str:
     """Error text: the grasps that were given instead of the split's, and what to do."""
     if not seen:
-        if hands and not hands_seen & set(hands):
-            return (f"no grasps of {', '.join(hands)} were given, but of {', '.join(sorted(hands_seen))}; name one of these "
-                    "with hands=..., or leave it out")
         return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tests others"
     counts = ", ".join(f"{number} of split '{name}'" for name, number in sorted(seen.items()))
     fitting = sorted(name for name, allowed in SPLITS.items() if allowed & set(seen))

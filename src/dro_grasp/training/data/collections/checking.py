@@ -11,6 +11,7 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import require_seed
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, Protocol
@@ -64,13 +65,15 @@ def stored_protocol(pairs: Iterable[PairGrasps]) -> str:
 def check(
     pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
 ) -> Agreement:
-    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts."""
+    """Evaluate a random sample of stored grasps with a verdict again, all if there are fewer, and compare verdicts."""
     if sample < 1:
         raise OptionError(f"sample is {sample}; check at least one grasp")
-    parts = [pair.grasps for pair in pairs if len(pair.grasps)]
+    require_seed(seed)
+    parts = [pair.grasps[pair.grasps.evaluated] for pair in pairs]
     sizes = [len(grasps) for grasps in parts]
-    if not parts:
-        raise GraspFileError("the data set holds no grasp; there is nothing to check")
+    if not sum(sizes):
+        raise GraspFileError("the data set holds no grasp that has had a trial; there is nothing to check. "
+                             "`dro-grasp evaluate` tests grasps that had none")
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(seed))
     chosen = torch.zeros(sum(sizes), dtype=torch.bool)
     chosen[order[:sample]] = True

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from dro_grasp._version import __version__
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.grasp_file import read_footer
@@ -93,6 +93,14 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
         yield replace(pair, grasps=pair.grasps[pair.grasps.trial_success]) if only_successful else pair
     if empty:
         raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without only_successful=True")
+
+
+def require_apart(inputs: Sequence[Path | str], output: Path | str) -> None:
+    """Refuse an output folder that is a data set, or in which one is a file: OptionError."""
+    for path in map(given_path, inputs):
+        if given_path(output).resolve() in (path.resolve(), *[path.resolve().parent] * path.is_file()):
+            raise OptionError(f"{path} would be replaced by, or mixed with, what is made of it; write into another folder "
+                              "(output=...)")
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:

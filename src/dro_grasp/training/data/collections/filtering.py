@@ -207,8 +207,8 @@ def filter_dataset(
 
 def _begin(folder: Path, config: FilterConfig) -> None:
     """Refuse a folder with grasps of another command, or of other settings."""
-    if not (folder / SETTINGS).exists() and find_shards(folder):
-        raise OptionError(f"{folder} holds grasps of `dro-grasp synthesize`; give a folder of its own to what passes")
+    if not (folder / SETTINGS).exists() and (find_shards(folder) or any(folder.glob("*.parquet"))):
+        raise OptionError(f"{folder} holds grasps of another command; give a folder of its own to what passes (output=...)")
     agree(folder, config.settings)
 
 

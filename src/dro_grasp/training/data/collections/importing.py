@@ -210,14 +210,19 @@ def import_grasps(
     if not paths:
         raise OptionError(f"no file to import was given; name at least one {kind} file")
     groups: dict[tuple[str, str, float], list[ForeignGrasp]] = {}
+    named: set[str] = set()
     for path in paths:
         for grasp in read_foreign(path, kind):
+            named.add(grasp.hand)
             hand = hands.get(grasp.hand, hands.get("") or grasp.hand)
             if not hand:
                 raise OptionError(f"{path} does not name its hand; name it with hands=...")
             if not (obj or grasp.object):
                 raise OptionError(f"{path} does not name its object; name it with object=...")
             groups.setdefault((hand, obj or grasp.object, grasp.scale), []).append(grasp)
+    if named and (unknown := sorted(hands.keys() - named - {""})):
+        theirs = ", ".join(sorted(named - {""})) or "none"
+        raise OptionError(f"no grasp is of a hand called {', '.join(unknown)}; the hands in the files are {theirs} (hands=...)")
     batches: dict[str, list[GraspBatch]] = {}
     missing: dict[str, str] = {}
     for (hand, name, scale), grasps in groups.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from dro_grasp.grasps.grasp_file import encode, table_bytes
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.training.data.collections.collection import read_collection, yield_notes
-from dro_grasp.training.data.engine.shards import Yield
+from dro_grasp.training.data.engine.shards import Yield, find_shards
 
 POSITION_STEP = 2.0**-16  # Grid of positions in merged files [m]. Ours: 0.015 mm
 ANGLE_STEP = 2.0**-13  # Grid of joints, pregrasps and squeezes in merged files [rad or m]. Ours: 0.12 mrad
@@ -96,11 +97,24 @@ def file_name(hand: str, number: int = 1) -> str:
     return f"{hand.replace('/', '-')}{'' if number == 1 else f'.{number}'}.parquet"
 
 
+def require_no_shards(folder: Path) -> None:
+    """Refuse a folder with a file for each pair, which merged files would hide: OptionError."""
+    if folder.is_dir() and find_shards(folder):
+        raise OptionError(f"{folder} holds grasps of another command, pair by pair; give a folder of its own to what is merged "
+                          "(output=...)")
+
+
+def remove_further(folder: Path, hand: str, number: int) -> None:
+    """Remove what an earlier merge left of a hand in a folder: files with higher numbers than those written."""
+    for path in takewhile(Path.exists, (folder / file_name(hand, further) for further in count(number + 1))):
+        path.unlink()
+
+
 def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, list[Waiting]]]:
     """The grasps of all data sets by hand and object, in files."""
     pairs: dict[str, dict[str, list[Waiting]]] = {}
     versions: dict[tuple[str, str], set[str]] = {}
-    for count, (source, pair) in enumerate((path, pair) for path in paths for pair in read_collection(path)):
+    for place, (source, pair) in enumerate((path, pair) for path in paths for pair in read_collection(path)):
         grasps = pair.grasps
         # The pair may have been requested by path.
         name = grasps.object[0] if len(grasps) else pair.object
@@ -114,7 +128,7 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
                 raise GraspFileError(f"{kind} '{own}' in {source} is not the same everywhere in the data sets (hashes "
                                      f"{hashes}): another {kind} of this name, or another version of it. Merge them apart, or "
                                      "rename one file and make its grasps again")
-        file = folder / f"{count}.parquet"
+        file = folder / f"{place}.parquet"
         grasps.save(file)
         pairs.setdefault(grasps.hand, {}).setdefault(name, []).append(Waiting(file, pair.made))
     return pairs
