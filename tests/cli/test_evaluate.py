@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,9 @@ import pytest
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.sources.controls import palm_facing_starts
+from tests.helpers.loaded_hands import loaded_hand
 
 
 def test_evaluation_with_another_hand_is_told(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,3 +56,14 @@ def test_outcomes_on_another_object_are_not_stored_as_those_on_its_own(
     assert main(["evaluate", str(path), "--output", str(output)]) == 2
     assert "another object 'can'" in capsys.readouterr().err
     assert not output.exists()
+
+
+def test_what_was_asked_for_in_vain_stays_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hand = loaded_hand("gripper3")
+    found = palm_facing_starts(hand, load_object("sphere"), num=2, seed=0).with_asked(2)
+    lost = GraspBatch.none(hand, load_object("can")).replace(asked_of={("can", load_object("can").sha256): 4})
+    path, tried = tmp_path / "both.parquet", tmp_path / "tried.parquet"
+    GraspBatch.concatenate([found, lost]).save(path)
+    for file, *more in ((path, "--output", str(tried)), (tried,)):
+        assert main(["evaluate", str(file), "--json", *more]) == 0
+        assert json.loads(capsys.readouterr().out)["asked"] == 6

@@ -175,6 +175,8 @@ def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
 
     for module in (checking, filtering):
         monkeypatch.setattr(module, "simulate", none)
+    grasps = GraspBatch.load(beside_a_cloud)
+    grasps.replace(protocol=("carry/1",) * len(grasps)).save(beside_a_cloud)
     assert main(["dataset", *command.split(), str(beside_a_cloud)]) == 2
     assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -25,7 +26,7 @@ from dro_grasp.grasps.sources import object_of
 pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.apps.server.answering import Answerer, ServerConfig
-from dro_grasp.apps.server.messages import GenerateCall
+from dro_grasp.apps.server.messages import GenerateCall, GraspCall
 
 TUBE = trimesh.creation.cylinder(0.03, 0.1)
 HEAVY = {"torch", "numpy", "scipy", "mujoco", "trimesh", "pyarrow", "pandas", "pydantic", "fastapi", "uvicorn", "matplotlib"}
@@ -110,6 +111,15 @@ def test_the_file_of_a_sent_mesh_records_where_it_lies(own: Path, server: str, t
     base = ["generate", "--hand", "gripper3", "--object", str(own), "--server", server, "--output", str(output)]
     assert main([*base, *options]) == 0
     assert object_of(GraspBatch.load(output), None, 1.0).volume == pytest.approx(TUBE.volume, rel=1e-3)
+
+
+def test_the_file_of_an_object_that_the_server_has_records_where_it_lies(own: Path, weights: str, tmp_path: Path) -> None:
+    answerer = Answerer(ServerConfig(weights, hands=("gripper3",), objects=(str(own),)))
+    call = {"hand": "gripper3", "object": {"name": "tube", "scale": 0.9}, "num": 1, "source": "network", "candidates": 1}
+    answer = answerer.answer(GenerateCall(**call, protocol="none"))
+    (tmp_path / "grasps.parquet").write_bytes(base64.b64decode(answer.file))
+    assert object_of(GraspBatch.load(tmp_path / "grasps.parquet"), None, 1.0).volume == pytest.approx(0.9**3 * TUBE.volume, rel=1e-3)
+    assert answerer.answer(GraspCall(**call)).seconds["total"] > 0, "as `generate --json` calls it"
 
 
 def test_json_is_the_same_and_the_environment_may_name_the_server(

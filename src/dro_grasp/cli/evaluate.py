@@ -40,7 +40,8 @@ class Evaluate:
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use instead of the one named in the file, for a file with one object."""
-    scale: float = 1.0  # Scale of the mesh given with --object.
+    scale: Annotated[float | None, optional("FACTOR", "that of the file's object")] = None
+    """Scale of the mesh given with --object."""
     mass: Mass = None
     """Mass of every object [kg], instead of the one that the file records."""
     contact_quality: Flag = False
@@ -66,6 +67,7 @@ class Evaluate:
         hand = hand_of(grasps, self.hand)
         compare("hand", grasps.hand, grasps.hand_sha256, hand, self.output)
         require_one_object(grasps, self.object, self.file)
+        require_object(self.scale, self.object)
         problems, bare = self._problems(hand, grasps)
         evaluated: dict[str, GraspBatch] = {}
         with progress_bar("evaluating", self.json) as progress:
@@ -74,7 +76,8 @@ class Evaluate:
                 done = evaluate(problem, part, rules, progress, another=self.object is not None)
                 evaluated[name] = with_contacts(hand, problem.obj, done, rules) if self.contact_quality else done
         if self.output is not None:
-            GraspBatch.concatenate([*evaluated.values(), *bare.values()]).save(self.output)
+            done = GraspBatch.concatenate([*evaluated.values(), *bare.values()])
+            done.replace(asked_of=grasps.asked_of).save(self.output)  # of objects without any grasp, too
         there = set(zip(grasps.object, grasps.object_sha256, strict=True))
         lost = {key[0]: num for key, num in grasps.asked_of.items() if key not in there}
         self._report(hand, rules, evaluated, lost, list(bare), time.perf_counter() - begin)
@@ -145,7 +148,13 @@ class Evaluate:
         print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, *notes)
 
 
-def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:
+def require_object(scale: float | None, given: str | None) -> None:
+    """Refuse the scale of an object that is not given: OptionError."""
+    if scale is not None and given is None:
+        raise OptionError(f"--scale is {scale:g}, for an object that is given; name the object, too: --object NAME|PATH")
+
+
+def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None = None) -> None:
     """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones."""
     from dro_grasp.grasps.sources import made_for_another
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from dro_grasp.cli.evaluate import compare
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say
 from dro_grasp.errors import GraspFileError, OutputError
@@ -93,14 +94,21 @@ class Export:
         hand = hand_of(grasps, self.hand) if needed or self.hand is not None else None
         if hand is not None:
             grasps.require_hand(hand)
-        obj = object_of(grasps, self.object, 1.0) if FORMATS[self.format].needs_object or self.hold or not stated else None
+            compare("hand", grasps.hand, grasps.hand_sha256, hand)
+        needed = FORMATS[self.format].needs_object or not stated or self.hold
+        obj = object_of(grasps, self.object) if needed or self.object is not None else None
+        if obj is not None:
+            compare("object", grasps.object[0], next(filter(None, grasps.object_sha256), ""), obj)
         if hand is not None and obj is not None and not stated:
             grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=grasps.joints.dtype))
         if hand is not None and obj is not None and self.hold:
             from dro_grasp.simulation.holding import expect_hold
 
             grasps = expect_hold(hand, obj, grasps)
-        return ExportJob(grasps, frame, hand, *object_source(grasps), obj)
+        path, scale = object_source(grasps)
+        if obj is not None and self.object is not None:
+            path, scale = obj.file or self.object, obj.scale
+        return ExportJob(grasps, frame, hand, path, scale, obj)
 
 
 def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from dro_grasp.cli.evaluate import compare, require_object
 from dro_grasp.cli.given_scene import ROBOT, seen_from
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import say_file
@@ -46,7 +47,8 @@ class View:
     """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to show first: a name in the file, or a mesh to use for the file's only object. Without a file: any object."""
-    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object, or of --scene.
+    scale: Annotated[float | None, optional("FACTOR", "1, or that of the file's object")] = None
+    """Factor for the coordinates of the mesh given with --object, or of --scene."""
     scene: Annotated[Path | None, optional("CLOUD|DEPTH", "none")] = None
     """What a camera saw, a cloud or a depth image: click a thing in it, and see grasps of it with all else as obstacles; with
     --robot, also plan and play the motion. Without --camera, the cloud is in the frame of the grasps."""
@@ -125,7 +127,7 @@ class View:
             from dro_grasp.apps.viewer.scene_page import ScenePage
 
             hand = load_hand(self.hand or "allegro")
-            scene = load_scene(file, scale=self.scale, camera=camera)
+            scene = load_scene(file, scale=1.0 if self.scale is None else self.scale, camera=camera)
             made = partial(ScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, hand=hand)
         else:
             require_extra("arm")
@@ -134,7 +136,7 @@ class View:
 
             robot = load_robot(self.robot)
             camera = seen_from(self.camera, robot)
-            scene = load_scene(file, scale=self.scale, camera=camera)
+            scene = load_scene(file, scale=1.0 if self.scale is None else self.scale, camera=camera)
             made = partial(RobotScenePage, predictor=GraspPredictor(self.weights, self.device), scene=scene, robot=robot)
         _ = scene.segments  # refused before a browser comes
         return lambda client, turn: made(client, turn=turn, camera=camera)
@@ -158,7 +160,7 @@ class View:
         from dro_grasp.objects.catalogue import load_object
 
         hand = None if self.hand is None else load_hand(self.hand)
-        obj = None if self.object is None else load_object(self.object, scale=self.scale)
+        obj = None if self.object is None else load_object(self.object, scale=1.0 if self.scale is None else self.scale)
         return self._pages(None if hand is None and obj is None else lambda studio: studio.offer(hand, obj))
 
     def _pages(self, fill: Callable[[Studio], None] | None) -> Callable[[Client, Lock], Studio]:
@@ -197,7 +199,8 @@ class Picture:
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None  # Hand to use instead of the one named in the file.
     object: Annotated[str | None, optional("NAME|PATH", "every object in the file")] = None
     """Object to draw: a name in the file, or a mesh to use for the file's only object. Several objects share the sheet."""
-    scale: float = 1.0  # Factor for the coordinates of the mesh given with --object.
+    scale: Annotated[float | None, optional("FACTOR", "that of the file's object")] = None
+    """Factor for the coordinates of the mesh given with --object."""
 
     def run(self) -> int:
         """Load the file and draw."""
@@ -210,6 +213,7 @@ class Picture:
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
+        compare("hand", grasps.hand, grasps.hand_sha256, hand)
         pairs = self.pairs(grasps)
         shown = sum(len(own) for _, own in pairs)
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
@@ -229,6 +233,8 @@ class Picture:
             name for name, own in grasps.by_object() if len(wanted(own))]
         share = max(1, self.count // max(1, len(names)))
         pairs = [of_object(grasps, name, self.scale) for name in names[: self.count]]
+        for obj, own in pairs:
+            compare("object", own.object[0], next(filter(None, own.object_sha256), ""), obj)
         pairs = [(obj, wanted(own)[:share]) for obj, own in pairs]
         if self.only_successful and not any(len(own) for _, own in pairs):
             of = "" if self.object is None else f" of {self.object}"
@@ -236,6 +242,7 @@ class Picture:
         return pairs
 
     def _check_options(self) -> None:
+        require_object(self.scale, self.object)
         for option, value in (("--count", self.count), ("--columns", self.columns)):
             if value < 1:
                 raise OptionError(f"{option} is {value}; give at least 1")
@@ -303,7 +310,7 @@ def is_motion(file: Path) -> bool:
         return False
 
 
-def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
+def of_object(grasps: GraspBatch, name: str | None, scale: float | None) -> tuple[ObjectModel, GraspBatch]:
     """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first."""
     from dro_grasp.grasps.sources import object_of
 
@@ -313,4 +320,4 @@ def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[Objec
         raise OptionError(f"--object is '{name}', but the grasps are of {len(parts)} objects ({listed}); give one of these "
                           "names: another object fits only a file of one object")
     own = name if name in parts else grasps.object[0]
-    return object_of(parts[own], None if name in {None, own} else name, scale), parts[own]
+    return object_of(parts[own], None if name == own and scale is None else name, scale), parts[own]

@@ -40,7 +40,7 @@ DEPTH = "depth"  # Further column of synthesized grasps: deepest penetration of 
 RELABELLED = "relabelled"  # Further column of stored grasps: whether idle fingers were closed after the grasp was made
 HAND_FILE = "hand_file"  # Further column: path of the hand's description, if the hand is a user's own
 OBJECT_FILE = "object_file"  # Further column: path of the object, if it is a user's own
-OBJECT_SCALE = "object_scale"  # Further column: scale of that file
+OBJECT_SCALE = "object_scale"  # Further column: scale of that file, or of the object of that name
 OBJECT_CLOUD = "object_cloud"
 """Further column: the object, if it is a cloud that is in no file, as taken out of a scene; NPZ in base64."""
 OBJECT_MASS = "object_mass"  # Further column: mass that was stated of the object [kg]; NaN for none

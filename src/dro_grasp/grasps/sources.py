@@ -24,13 +24,11 @@ if TYPE_CHECKING:
 def with_sources(
     grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None, taken: ObjectModel | None = None
 ) -> GraspBatch:
-    """Grasps of one object that record the files of their hand and object, unless their names are built-in.
+    """Grasps of one object that record the files of their hand and object, unless their names are built-in, and the scale.
 
     `camera` is the pose of the camera that saw the object, in the frame of the grasps; `taken` a cloud that is in no file.
     """
-    file = given_path(obj)
-    known = taken is None and file.is_file()
-    return recorded(grasps, hand_file(hand), str(file.resolve()) if known else None, scale, camera, taken)
+    return recorded(grasps, hand_file(hand), object_file(obj) if taken is None else None, scale, camera, taken)
 
 
 def hand_file(hand: str) -> str | None:
@@ -43,20 +41,32 @@ def hand_file(hand: str) -> str | None:
     return named(given_path(file).resolve(), link) if own else None
 
 
+def object_file(obj: str) -> str | None:
+    """The file of an object, or its folder of DexGraspBench, if it was given by its path."""
+    from dro_grasp.objects.catalogue import processed_folder
+
+    path = given_path(obj)
+    return str(path.resolve()) if path.is_file() or processed_folder(path) is not None else None
+
+
 def recorded(
     grasps: GraspBatch, hand: str | None, obj: str | None, scale: float, camera: NamedMotion | None = None,
     taken: ObjectModel | None = None,
 ) -> GraspBatch:
-    """Grasps of one object that record the files of their hand and object, or the cloud that was taken, and the camera."""
+    """Grasps of one object that record the files of their hand and object, or the cloud that was taken, and the camera.
+
+    The scale is recorded with a file, and where it is not 1; that of a taken cloud is in its points.
+    """
     import torch
 
-    n, extra = len(grasps), dict(grasps.extra)
+    n, extra = len(grasps), {name: column for name, column in grasps.extra.items() if name != OBJECT_SCALE}
     if hand is not None:
         extra[HAND_FILE] = (hand,) * n
     if obj is not None:
         extra[OBJECT_FILE] = (obj,) * n
-        extra[OBJECT_SCALE] = torch.full((n,), scale)
         extra.pop(OBJECT_CLOUD, None)  # the file has it
+    if obj is not None or (scale != 1 and taken is None):
+        extra[OBJECT_SCALE] = torch.full((n,), scale)
     if taken is not None:
         extra[OBJECT_CLOUD] = (packed_cloud(taken),) * n
     if camera is not None:
@@ -115,10 +125,13 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
                         "hand=...") from error
 
 
-def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float | None = None) -> ObjectModel:
+def object_of(
+    grasps: GraspBatch, given: str | None, scale: float | None = None, mass: float | None = None
+) -> ObjectModel:
     """The object of grasps of one object, or the given one, with this mass [kg]; None takes the one that the grasps record.
 
-    `scale` is that of an object whose grasps record none.
+    `scale` is that of the given one, or of an object whose grasps record none. None is 1, and what the grasps record for a
+    given file.
 
     Raises:
         ObjectError: It is not found, and the message asks for --object; or the grasps record several masses.
@@ -130,16 +143,17 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float, mass: float |
     return obj if mass is None else with_mass(obj, mass)
 
 
-def _object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
+def _object_of(grasps: GraspBatch, given: str | None, scale: float | None) -> ObjectModel:
     """The object, whatever was stated of its mass; a table in its cloud is kept if the grasps kept it."""
     from dro_grasp.objects.catalogue import load_object
 
     if given is not None:
-        return load_object(given, scale=scale)
+        recorded_scale = object_source(grasps)[1] if given_path(given).is_file() else 1.0
+        return load_object(given, scale=recorded_scale if scale is None else scale)
     if (taken := _recorded(grasps, OBJECT_CLOUD)) is not None:
         return unpacked_cloud(taken, grasps.object[0])
     try:
-        source, own_scale = object_source(grasps, scale)
+        source, own_scale = object_source(grasps, 1.0 if scale is None else scale)
         pose = camera_pose(grasps)
 
         def loaded(keep_table: bool) -> ObjectModel:
@@ -167,13 +181,12 @@ def require_one_object(grasps: GraspBatch, given: str | None, file: Path) -> Non
 
 
 def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
-    """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
-    source = _recorded(grasps, OBJECT_FILE)
-    if source and OBJECT_SCALE in grasps.extra:
+    """File or name of the object of some grasps, and its scale; `scale` is for grasps that record none."""
+    if OBJECT_SCALE in grasps.extra:
         known = grasps.extra[OBJECT_SCALE]
         known = known[known.isfinite()]
         scale = _as_given(known[0]) if len(known) else scale
-    return source or grasps.object[0], scale
+    return _recorded(grasps, OBJECT_FILE) or grasps.object[0], scale
 
 
 def recorded_mass(grasps: GraspBatch) -> float | None:

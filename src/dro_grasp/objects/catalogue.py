@@ -56,6 +56,7 @@ def load_object(
     """
     check_scale(scale)
     obj = _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table)
+    obj = obj if obj.scale == scale else replace(obj, scale=scale)
     obj = obj if name is None else replace(obj, name=name)
     return obj if mass is None else with_mass(obj, mass)
 

@@ -35,7 +35,7 @@ from dro_grasp.frames import NamedMotion, is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import REASON
 from dro_grasp.grasps.forces import efforts_of, known, squeeze_efforts
-from dro_grasp.grasps.sources import hand_file, recorded
+from dro_grasp.grasps.sources import hand_file, object_file, recorded
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
@@ -113,7 +113,7 @@ class Answerer:
         middle = time.perf_counter()
         grasps = made.grasps if call.protocol is None else evaluate(problem, made.grasps, call.protocol, progress)
         warning = problem.constraints.warning(obj)
-        seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
+        seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "total": time.perf_counter() - begin}
         return GraspAnswer(
             id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
             wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(hand, grasps, made),
@@ -131,8 +131,10 @@ class Answerer:
             obj.cut(progress)
         made = self.predictor.run(problem, request, progress)
         begin, protocol = time.perf_counter(), protocol_for(obj, call.protocol)
+        own = self.library.own["object"].get(call.object.name or "")
+        path = call.path if own is None else object_file(own)
         # The command's predictor records the file of an object that no camera saw, which has none here.
-        grasps = recorded(made.grasps, None, None if call.camera else call.path, call.object.scale)
+        grasps = recorded(made.grasps, None, None if call.camera else path, call.object.scale)
         grasps = grasps if protocol == NO_TRIAL else evaluate(problem, grasps, protocol, progress)
         trial = time.perf_counter() - begin if bool(grasps.evaluated.any()) else 0.0
         frame = "object" if call.camera is None else call.camera.frame
@@ -143,7 +145,7 @@ class Answerer:
         camera = None if call.camera is None else NamedMotion(call.camera.frame, sent_pose(call.camera).float())
         taken = None if call.choose is None else obj
         file = recorded(
-            kept, self.hand_files.get(hand.name), None if taken else call.path, call.object.scale, camera, taken).to_bytes()
+            kept, self.hand_files.get(hand.name), None if taken else path, call.object.scale, camera, taken).to_bytes()
         text = base64.b64encode(file).decode()
         return GenerateAnswer(
             **told._asdict(), file=text, kept=len(kept), seconds={"load": loaded, **made.seconds, "trial": trial},
