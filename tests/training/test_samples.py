@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,9 +13,10 @@ import pytest
 import torch
 from scipy.stats import kstest
 
+from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
 from dro_grasp.network.network import untrained_network
-from dro_grasp.training.config import AugmentationConfig, PretrainConfig, TrainConfig
+from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle, write_bundle
 from dro_grasp.training.pretraining import contrastive_step, posture_clouds
 from dro_grasp.training.samples import SampleSource
@@ -93,3 +96,30 @@ def test_pretraining_learns_from_hands_without_grasps(mixed: SampleSource, frame
 def test_powers_that_say_nothing_are_refused(value: float) -> None:
     with pytest.raises(OptionError, match="by_count is"):
         TrainConfig(by_count=value)
+
+
+@pytest.mark.parametrize(("make", "told"), [
+    (lambda: TrainConfig(samples_per_hand=0), r"samples_per_hand is 0; give a number from 1 on \(samples_per_hand=...\)"),
+    (lambda: TrainConfig(hands_per_step=0), "hands_per_step is 0"), (lambda: TrainConfig(columns=-1), "columns is -1"),
+    (lambda: AugmentationConfig(partial=5.0), "partial is 5.0; give a share from 0 to 1"),
+    (lambda: AugmentationConfig(object_noise=-0.1), "object_noise is -0.1"),
+    (lambda: LossConfig(divergence=-1.0), "divergence is -1.0; give a number from 0 on"),
+    (lambda: LossConfig(pose=math.nan), "pose is nan"), (lambda: LossConfig(flow=math.inf), "flow is inf"),
+])
+def test_settings_that_train_nothing_are_refused(make: Callable[[], object], told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        make()
+
+
+@pytest.mark.parametrize(("command", "options", "told"), [
+    ("pretrain", ["--motion-steps", "0"], "--motion-steps is 0"),
+    ("train", ["--validation-samples", "0"], "--validation-samples is 0"),
+    ("train", ["--columns", "0"], "(--columns)"), ("train", ["--divergence", "nan"], "divergence is nan"),
+    ("train", ["--partial", "5"], "partial is 5.0"),
+])
+def test_commands_refuse_them_before_they_read_the_bundle(
+    command: str, options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = ["--bundle", "none.safetensors", "--run-folder", str(tmp_path / "run"), "--output", str(tmp_path / "w.safetensors")]
+    assert main([command, *files, "--device", "cpu", *options]) == 2
+    assert told in capsys.readouterr().err

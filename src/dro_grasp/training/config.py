@@ -10,6 +10,13 @@ from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked
 
 
+def _require(config: object, least: int, *names: str) -> None:
+    """Refuse fields of a configuration that are less than `least`, infinite or NaN: OptionError."""
+    for name in names:
+        if not least <= (value := getattr(config, name)) < math.inf:
+            raise OptionError(f"{name} is {value}; give a number from {least} on ({name}=...)")
+
+
 @dataclass(frozen=True)
 class AugmentationConfig(Checked):
     """How a training sample differs from the stored grasp."""
@@ -30,6 +37,12 @@ class AugmentationConfig(Checked):
     dozen hands are few. Source: ours."""
     partial: float = 0.0
     """Share of samples in which half of the object is seen. Source: appendix."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self, 0, "object_noise", "placement_rotation", "placement_shift", "tilt", "proportions")
+        if not 0 <= self.partial <= 1:
+            raise OptionError(f"partial is {self.partial}; give a share from 0 to 1 (partial=...)")
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,10 @@ class LossConfig(Checked):
     """Weight of the flow's loss; not in the paper's form."""
     placement: float = 0.01
     """Weight of the placement prior's loss; it shares no parameter with the rest."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self, 0, "distance", "pose", "penetration", "divergence", "motion", "flow", "placement")
 
 
 LOSSES = {"ours": LossConfig(), "release": LossConfig(penetration=1.0, divergence_form="official")}
@@ -112,6 +129,7 @@ class TrainConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _require(self, 1, "hands_per_step", "samples_per_hand", "columns")
         if not 0 <= self.by_count <= 1:
             raise OptionError(f"by_count is {self.by_count}; give 0 to draw all hands equally often, 1 to draw them by their "
                               "grasps, or a number between")
