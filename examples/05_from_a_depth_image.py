@@ -19,10 +19,10 @@ in_base = dro.visible_points(duck, direction, torch.Generator().manual_seed(0), 
 
 # With a real camera: points = dro.depth_points(depth, intrinsics, mask), and T_base_camera from the calibration.
 points = (in_base - T_base_camera[:3, 3]) @ T_base_camera[:3, :3]
-obj = dro.scanned_object("seen", points, T_base_camera)
-
-table = float(duck.cloud[:, 2].min())  # The robot knows the height of the table that it is mounted on.
-grasps = dro.GraspPredictor().predict(dro.load_hand("allegro"), obj, num=8, direction=(0.0, 0.0, -1.0), table=table)
+height = float(duck.cloud[:, 2].min())  # The robot knows the height of the table that it is mounted on.
+table = [*T_base_camera[2, :3], height - T_base_camera[2, 3]]  # The same plane in the camera's frame: the duck stands on it.
+obj = dro.scanned_object("seen", points, T_base_camera, table=table)
+grasps = dro.GraspPredictor().predict(dro.load_hand("allegro"), obj, num=8, direction=(0.0, 0.0, -1.0), table=height)
 print(f"{obj.notes[0]}")
 for place, score in zip(grasps.T_object_wrist[:3, :3, 3].tolist(), grasps.score.tolist(), strict=False):
     x, y, z = place

@@ -118,7 +118,8 @@ def test_the_file_of_an_object_that_the_server_has_records_where_it_lies(own: Pa
     call = {"hand": "gripper3", "object": {"name": "tube", "scale": 0.9}, "num": 1, "source": "network", "candidates": 1}
     answer = answerer.answer(GenerateCall(**call, protocol="none"))
     (tmp_path / "grasps.parquet").write_bytes(base64.b64decode(answer.file))
-    assert object_of(GraspBatch.load(tmp_path / "grasps.parquet"), None, 1.0).volume == pytest.approx(0.9**3 * TUBE.volume, rel=1e-3)
+    back = object_of(GraspBatch.load(tmp_path / "grasps.parquet"), None, 1.0)
+    assert back.volume == pytest.approx(0.9**3 * TUBE.volume, rel=1e-3)
     assert answerer.answer(GraspCall(**call)).seconds["total"] > 0, "as `generate --json` calls it"
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from dro_grasp.cli.benchmark import cells
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.metrics import wilson_interval
-from dro_grasp.compare.rows import Row, average
+from dro_grasp.compare.rows import EvaluatedGrasps, Row, average, hand_row
 from dro_grasp.compare.stages import BEST, EQUAL_TIME, RANKED, RAW, REFINED, RETURNED, STAGES, BenchmarkConfig, benchmark
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
@@ -161,3 +163,14 @@ def test_the_average_of_hands_with_one_number_has_the_interval_of_all() -> None:
     assert whole.success[STRICT] == pytest.approx((11 / 16, *wilson_interval(11, 16)))
     alone = average([row("a", 3, 8), row("b", 0, 0)])
     assert alone.success[STRICT] == pytest.approx((3 / 8, *wilson_interval(3, 8)))
+
+
+@pytest.mark.parametrize("name", ["carry", "dexgraspbench", "dro"])
+def test_every_force_counts_where_each_starts_anew(name: str) -> None:
+    grasps = GraspBatch.create(HAND, CAN, torch.eye(4).repeat(3, 1, 1), HAND.canonical_joints().repeat(3, 1))
+    moved = torch.tensor([[4.0, 1, 1, 1, 1, 2], [1, 1, 8, 1, 1, 6], [99, 99, 99, 99, 99, 99]]) / 1000
+    trial = SimpleNamespace(success=torch.tensor([True, True, False]), displacement=moved, rotation=10 * moved,
+                            fingers_in_contact=torch.ones(3), robustness=torch.full((3,), torch.nan))
+    row = hand_row("a", RAW, [EvaluatedGrasps(grasps, (trial,), {}, 3, 3)], (protocol(name),))  # type: ignore[arg-type]
+    expected = 0.006 if protocol(name).reset else 0.004
+    assert (row.displacement, row.rotation) == pytest.approx((expected, 10 * expected))

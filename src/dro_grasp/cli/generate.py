@@ -300,7 +300,7 @@ class Generate:
             return load_object(name, scale=self.scale, keep_table=self.keep_table, mass=self.mass)
         from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
 
-        return self._weighed(load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table))
+        return self._weighed(load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table, self.table))
 
     def _weighed(self, obj: ObjectModel) -> ObjectModel:
         """The object with the mass that was stated, if any."""

@@ -52,7 +52,9 @@ class Row:
     held: dict[str, int]  # Per protocol how many of them succeeded
     success: dict[str, tuple[float, float, float]]
     """Per protocol the share of successes and its 95 % interval (Wilson); the mean over hands in the row of all."""
-    displacement: float  # Mean displacement of the object over successes of the first protocol [m]
+    displacement: float
+    """Mean displacement of the object over successes of the first protocol, the largest of all forces where each starts anew,
+    else the last [m]."""
     rotation: float  # Mean rotation of the object, likewise [rad]
     diversity: float  # The paper's measure over successes of the first protocol, mixing m and rad as the paper does
     trials_held: dict[str, tuple[float, float, float]]
@@ -82,7 +84,9 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
             held_in[rules.label] = mean_share(torch.cat([t.results[i].robustness for t in parts]), asked)
         fingers[rules.label] = finger_contact(torch.cat([t.results[i].fingers_in_contact for t in parts]), parts[0].fingers)
     held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in parts])[success[0]]
-    first = [t.results[0] for t in parts]
+    displacement, rotation = (
+        torch.cat([values.amax(-1) if protocols[0].reset else values[:, -1] for values in columns])[success[0]]
+        for columns in zip(*[(t.results[0].displacement, t.results[0].rotation) for t in parts], strict=True))
     areas = {
         rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in parts])
         for i, rules in enumerate(protocols)
@@ -91,8 +95,7 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
     return Row(
         source, stage, parts[0].grasps.hand, asked, len(success[0]), numbers,
         {label: success_rate(k, asked) for label, k in numbers.items()},
-        displacement=float(torch.cat([r.displacement[r.success, -1] for r in first]).mean()),
-        rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
+        displacement=float(displacement.mean()), rotation=float(rotation.mean()),
         diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
         seconds=seconds, candidates=_mean([t.candidates for t in parts]),
         optimised=_mean([float(SYNTHESIZED.search(maker) is not None) for t in parts for maker in t.grasps.provenance]),

@@ -11,7 +11,16 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
-from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_CLOUD, OBJECT_FILE, OBJECT_MASS, OBJECT_SCALE
+from dro_grasp.grasps.columns import (
+    CAMERA,
+    FRAME,
+    HAND_FILE,
+    OBJECT_CLOUD,
+    OBJECT_FILE,
+    OBJECT_MASS,
+    OBJECT_SCALE,
+    table_planes,
+)
 from dro_grasp.grasps.recorded_cloud import packed_cloud, unpacked_cloud
 
 if TYPE_CHECKING:
@@ -156,18 +165,22 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float | None) -> Ob
         source, own_scale = object_source(grasps, 1.0 if scale is None else scale)
         pose = camera_pose(grasps)
 
-        def loaded(keep_table: bool) -> ObjectModel:
+        def loaded(keep_table: bool, height: float | None) -> ObjectModel:
             if pose is None:
                 return load_object(source, scale=own_scale, keep_table=keep_table)
             from dro_grasp.objects.perception.scan import load_scan  # with the completion of clouds
 
-            return load_scan(Path(source), pose.double().numpy(), own_scale, keep_table)
+            return load_scan(Path(source), pose.double().numpy(), own_scale, keep_table, height)
 
-        obj, hashes = loaded(keep_table=False), set(grasps.object_sha256) - {""}
-        if obj.table is not None and hashes and obj.sha256 not in hashes:
-            with suppress(ObjectError):
-                whole = loaded(keep_table=True)
-                return whole if whole.sha256 in hashes else obj
+        planes, hashes = table_planes(grasps), set(grasps.object_sha256) - {""}
+        height = None if pose is None or planes is None else float(planes[0, 3])
+        obj = loaded(keep_table=False, height=height)
+        if hashes and obj.sha256 not in hashes:
+            others = [(keep, z) for keep in (False, True) for z in dict.fromkeys((height, None))][1:]
+            for other in others if obj.table is not None else ():
+                with suppress(ObjectError):
+                    if (again := loaded(*other)).sha256 in hashes:
+                        return again
         return obj
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "

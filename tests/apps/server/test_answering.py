@@ -63,6 +63,21 @@ def test_answers_are_the_predictors_grasps(answerer: Answerer) -> None:
     assert scan.grasps[0].success is None
 
 
+def test_what_a_camera_saw_ends_on_the_table_that_is_asked_for(answerer: Answerer) -> None:
+    seen = TUBE.sample(2000, seed=0) + np.array([0, 0, 0.5])
+    seen = seen[seen[:, 2] < 0.5]  # the front, seen from beside the tube
+    T = trimesh.transformations.rotation_matrix(2.5, [1, 0, 0], [0.3, 0.2, 0.8])
+    height = float((seen @ T[:3, :3].T + T[:3, 3])[:, 2].min()) - 0.01
+    camera = {"frame": "base", "T_frame_camera": T.tolist()}
+
+    def asked(**table: float) -> dro.ObjectModel:
+        return answerer.problem(GraspCall(hand="gripper3", object={"points": seen.tolist()}, camera=camera, **table)).obj
+
+    plane = [*T[2, :3], float(np.float32(height)) - T[2, 3]]
+    assert asked(table=height).sha256 == dro.scanned_object("cloud", seen, T, table=plane).sha256
+    assert asked().sha256 == dro.scanned_object("cloud", seen, T).sha256 != asked(table=height).sha256
+
+
 def test_answers_carry_forces(answerer: Answerer) -> None:
     """Efforts no larger than the hand's, and null where something is unknown."""
     hand, obj = dro.load_hand("gripper3"), dro.load_object("can")

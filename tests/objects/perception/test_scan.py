@@ -369,6 +369,20 @@ def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
     assert torch.isfinite(palms).all()
 
 
+def test_what_a_camera_saw_ends_on_the_table_that_is_given(
+    command: list[str], depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    low = float((depth_points(depth, INTRINSICS) @ T_object_camera[:3, :3].T + T_object_camera[:3, 3])[:, 2].min())
+    height = low - 0.004
+    file = tmp_path / "g.parquet"
+    assert main([*command, "--num", "1", "--table", str(height), "--output", str(file)]) == 0
+    grasps = GraspBatch.load(file)
+    again = object_of(grasps, None, 1.0)
+    assert again.sha256 == grasps.object_sha256[0]
+    assert again.cloud[:, 2].min() == pytest.approx(height, abs=0.003)
+    assert "made for another" not in capsys.readouterr().err
+
+
 def test_a_file_remembers_the_frame_and_where_the_camera_stood(
     made: Path, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
 ) -> None:

@@ -41,7 +41,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
-from dro_grasp.objects.perception.scan import load_scan, scanned_object
+from dro_grasp.objects.perception.scan import level_plane, load_scan, scanned_object
 from dro_grasp.objects.perception.scene_files import SceneCamera
 from dro_grasp.objects.scenery import FoundObject, Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel, with_mass
@@ -158,7 +158,7 @@ class Answerer:
         if found is not None and found.obstacles is not None:
             obstacles = found.obstacles.joined(obstacles)
         constraints, hand = settings_in(call, Constraints, obstacles=obstacles), self.hand(call.hand)
-        key, obj = self.object(call.object, call.camera) if found is None else (found.obj.sha256, found.obj)
+        key, obj = self.object(call.object, call.camera, call.table) if found is None else (found.obj.sha256, found.obj)
         obj = obj if call.mass is None else with_mass(obj, call.mass)
         pair = hand.name, key, call.mass, constraints
         if (problem := self.problems.get(pair)) is None:
@@ -184,8 +184,10 @@ class Answerer:
                             f"`dro-grasp serve --hand FILE` for another one")
         return self.library.hand(name)
 
-    def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
-        """An object that was named or sent, and the key under which it is kept.
+    def object(
+        self, sent: SentObject, camera: SentCamera | None, height: float | None = None
+    ) -> tuple[Hashable, ObjectModel]:
+        """An object that was named or sent, and the key under which it is kept; what a camera saw stands at a height [m].
 
         Raises:
             ObjectError: It cannot be used, or the server knows none of this name.
@@ -196,8 +198,8 @@ class Answerer:
         if sent.name is not None and sent.name not in (known := self.object_names()):
             raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
                               "/objects); send the mesh or cloud, or start it with `dro-grasp serve --object FILE`")
-        key = content_key(sent, camera)
-        return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
+        key = content_key(sent, camera), None if camera is None else height
+        return key, self.library.loaded("object", key, lambda: self._load(sent, camera, height))
 
     def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
         """Obstacles, in the frame of the grasps: what was sent, or an object of the server's own."""
@@ -245,15 +247,16 @@ class Answerer:
             except DroGraspError as error:
                 raise type(error)(str(error).replace(f"{folder}/", "")) from error
 
-    def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
+    def _load(self, sent: SentObject, camera: SentCamera | None, height: float | None) -> ObjectModel:
         with unpacked(sent, self.library.own["object"]) as source:
             if camera is None:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
             check_scale(sent.scale)
-            T, named = sent_pose(camera), isinstance(source, Path)
-            if named:
-                return load_scan(source, T.numpy(), sent.scale, sent.keep_table)
-            return scanned_object("cloud", source * sent.scale, T.numpy(), keep_table=sent.keep_table)
+            T = sent_pose(camera).numpy()
+            if isinstance(source, Path):
+                return load_scan(source, T, sent.scale, sent.keep_table, height)
+            return scanned_object(
+                "cloud", source * sent.scale, T, keep_table=sent.keep_table, table=level_plane(height, T))
 
 
 def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:

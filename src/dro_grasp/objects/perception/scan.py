@@ -139,13 +139,26 @@ def check_depths(median: float, scale: float | None = None, with_unit: bool = Tr
 
 
 def load_scan(
-    path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False
+    path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False,
+    height: float | None = None,
 ) -> ObjectModel:
-    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
+    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
+
+    `height` is that of its table in the named frame [m], where the cloud has none.
+    """
     check_scale(scale)
     rows = read_rows(path)
     rows[:, :3] *= scale
-    return scanned_object(path.stem, rows, T_frame_camera, keep_table=keep_table)
+    return scanned_object(
+        path.stem, rows, T_frame_camera, keep_table=keep_table, table=level_plane(height, T_frame_camera))
+
+
+def level_plane(height: float | None, T_frame_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"] | None:
+    """The plane at a height in the named frame [m], in the camera's: upward normal, and height along it; None for none.
+
+    The height is in single precision, as grasps record it.
+    """
+    return None if height is None else np.append(T_frame_camera[2, :3], float(np.float32(height)) - T_frame_camera[2, 3])
 
 
 @checked
@@ -169,8 +182,9 @@ def scanned_object(
             it.
         up: The upward direction in the camera's frame, (3,), of any length, which completion prefers; by default the normal
             of the table, or the wanted frame's z axis.
-        table: The plane on which the object stands, where it is cut off already: upward unit normal and height along it, (4,),
-            in the camera's frame [m].
+        table: The plane on which the object stands, where none is found in the cloud, as it is cut off already: upward unit
+            normal and height along it, (4,), in the camera's frame [m]. At height Z of the wanted frame, it is
+            [*T_frame_camera[2, :3], Z - T_frame_camera[2, 3]].
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
@@ -181,7 +195,7 @@ def scanned_object(
     T = None if T_frame_camera is None else given_pose(T_frame_camera)
     clean = _cleaned(given_points(points, name), name, denoise, keep_table)
     kept, camera = clean.rows[:, :3], np.zeros(3)
-    plane = clean.table if table is None else _given_plane(table)
+    plane = clean.table if clean.table is not None or table is None else _given_plane(table)
     normals, odd = facing_normals(clean.rows, name)
     if normals is None:
         normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
