@@ -153,6 +153,15 @@ def check_output(path: Path | str, *endings: str) -> Path:
     return path
 
 
+def require_distinct(**paths: Path | None) -> None:
+    """Refuse outputs, by their options' names, of which two are one file, by an OutputError."""
+    first: dict[Path, str] = {}
+    for name, path in paths.items():
+        if path is not None and (other := first.setdefault(given_path(path).resolve(), name)) != name:
+            raise OutputError(f"{path} is named twice, and one file would replace the other; give each a file of its own "
+                              f"({other}=..., {name}=...)")
+
+
 def check_folder(path: Path | str) -> Path:
     """Refuse a folder that is or lies in a file, or may not be written to, by an OutputError; nothing is created."""
     path = given_path(path)

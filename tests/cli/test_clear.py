@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import dro_grasp as dro
@@ -53,6 +54,9 @@ def test_tables_are_stored_told_and_not_repeated(
     assert "with 1.50 picks each" in out
     assert "3 of 6 judgements are right" in out
     assert "no grasp" in out
+    assert clear("--tables", 3, "--output", path, "--json") == 0
+    resumed = json.loads(capsys.readouterr().out)["results"]
+    assert resumed[:2] == told["results"]
     assert clear("--seed", 1, "--output", path) == 0
     assert clear("--tries", 2, "--output", path) == 0
     assert len(played) == 5, "another seed and other settings are other tables"
@@ -69,7 +73,8 @@ def test_each_table_is_drawn_of_the_objects(played: list[Any]) -> None:
 
 @pytest.mark.parametrize(("given", "told"), [
     (("--things", 4), "1 table of 4 things is asked for, of 3 objects"), (("--tables", 0), "0 tables of 3 things"),
-    (("--tries", 0), "tries is 0; give at least 1"), (("--bin", 0, 0, 0, 0, 0), "the bin has size"),
+    (("--tries", 0), "tries is 0; give at least 1"), (("--bin", 0, 0, 0, 0, 0), "size (0.0, 0.0) and walls of 0.0 m"),
+    (("--bin", "nan", 0.3, 0.3, 0.3, 0.1), "the bin has centre (nan, 0.3)"),
     (("--output", "tables.csv"), "give a name that ends in .jsonl"), (("--video", "clear.mp4"), ".gif or .webp"),
 ])
 def test_what_cannot_be_done_is_refused(
@@ -79,6 +84,15 @@ def test_what_cannot_be_done_is_refused(
     monkeypatch.chdir(tmp_path)
     assert clear(*given) == 2
     assert told in capsys.readouterr().err
+    assert played == []
+
+
+def test_a_bare_cloud_is_refused_before_a_table_is_drawn(played: list[Any], tmp_path: Path, capsys) -> None:
+    np.save(tmp_path / "points.npy", dro.load_object("sphere").cloud)
+    for number in range(4):  # whichever of them the tables hold
+        robot = ["clear", "--robot", "xarm7_leaphand", "--objects", *OBJECTS, str(tmp_path / "points.npy")]
+        assert main([*robot, "--things", "1", "--seed", str(number)]) == 2
+        assert "object 'points' is a bare cloud" in capsys.readouterr().err
     assert played == []
 
 

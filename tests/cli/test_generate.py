@@ -75,6 +75,16 @@ def test_outputs_are_checked_before_the_work(capsys) -> None:
     assert "no_hand" not in said
 
 
+def test_options_that_would_do_nothing_or_replace_one_another_are_refused(capsys) -> None:
+    base = ["generate", "--hand", "gripper3", "--object", "can"]
+    assert main([*base, "--margin", "2", "--max-force", "5", "--no-refine"]) == 2
+    assert "--margin and --max-force say how hands squeeze once they settle, and with --no-refine" in capsys.readouterr().err
+    assert main([*base[:3], "--scene", "c.ply", "--scene-picture", "a.png", "--picture", "./a.png"]) == 2
+    assert "named twice, and one file would replace the other" in capsys.readouterr().err
+    assert main(["benchmark", "--hands", "gripper3", "--objects", "can", "--max-force", "5"]) == 2
+    assert "--max-force says how hands squeeze" in capsys.readouterr().err
+
+
 def test_a_source_that_does_not_exist_is_told_before_the_work(capsys) -> None:
     base = ["generate", "--hand", "no_hand", "--object", "sphere", "--source"]
     for source, told in (("magic", "there is no source 'magic'"), ("nowhere.parquet", "nowhere.parquet"),

@@ -131,6 +131,8 @@ def test_an_object_in_the_air_is_planned_for_and_people_are_told(
     (["--least-confidence", "1"], "least_confidence is 1.0; give a probability from 0"),
     (["--least-confidence", "nan"], "least_confidence is nan"),
     (["--mass", "-1"], "mass is -1.0; give kilograms, above 0"),
+    (["--rehearsals", "-1"], "rehearsals is -1; give 0 or a number above it"),
+    (["--trajectory", "a.yaml", "--stages", "./a.yaml"], "named twice"),
     (["--efforts"], "--efforts are written into the trajectory file; name one with --trajectory YAML"),
     (["--place", "0.5", "0.1"], "give X Y Z of the object's foot in metres"),
     (["--place", "0.5", "0.1", "0", "--place-on", "table"], "--place and --place-on both say where to put the object"),

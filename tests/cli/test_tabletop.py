@@ -82,6 +82,8 @@ def test_people_see_objects_rates_and_every_attempt_aside(
     assert lifted("--output", "results.parquet") == 0
     assert len(done) == 4, "they are not repeated"
     assert capsys.readouterr().err == ""
+    assert lifted("--output", "results.parquet", "--plans", "plans") == 0
+    assert capsys.readouterr().err == "4 of 4 attempts are in --output already, and --plans gets none of them\n"
 
 
 def test_those_that_are_placed_are_counted_among_those_that_are_lifted(
@@ -108,7 +110,7 @@ def test_those_that_are_placed_are_counted_among_those_that_are_lifted(
     (["--seed", "-1"], "seed is -1; give an integer from 0 to 2^31 - 1"),
     (["--noise", "-0.001"], "noise is -0.001; give a standard deviation in metres from 0 on"),
     (["--noise", "nan"], "noise is nan"),
-    (["--clutter", "-1"], "clutter is -1"),
+    (["--clutter", "-1"], "clutter is -1"), (["--workers", "-3"], "workers is -3; give at least 1"),
     (["--mass", "0"], "mass is 0.0; give kilograms, above 0"),
     (["--mass", "250"], "250 g are 0.25 kg"),
     (["--plans", "mine"], "mine is a file; give a folder"),

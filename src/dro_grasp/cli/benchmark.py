@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
+from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, given_forces, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 from dro_grasp.errors import ObjectError, OptionError
 
@@ -52,8 +52,8 @@ class Benchmark:
     """Protocols of the trials. Displacement, rotation and diversity are means over the successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None  # Weights of the network.
     device: str = "cpu"  # Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU.
-    temperature: Annotated[float | None, optional("T", "as the weights say")] = None
-    """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
+    temperature: Annotated[float | None, optional("T", "1; 0.5 for bare clouds")] = None
+    """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 as diverse ones as in training, 2 the most."""
     least_confidence: Annotated[float | None, optional("P", "0.2")] = None
     """Grasps that hold with less probability are not returned, and count as failures; 0 returns all."""
     candidates: int = 4  # Most candidates for each grasp of stage returned, as in `generate`.
@@ -89,6 +89,10 @@ class Benchmark:
         from dro_grasp.simulation.protocols import protocol
 
         GraspRequest(self.num, candidates=self.candidates, temperature=self.temperature, least_confidence=self.least_confidence)
+        settles = {"settled", "returned", "equal-time"} & set(self.stages)
+        if not settles and (idle := given_forces(self.margin, self.max_force)):
+            raise OptionError(f"{idle} {'say' if ' and ' in idle else 'says'} how hands squeeze once they settle, and in "
+                              f"--stages {' '.join(self.stages)} none does; add settled, returned or equal-time")
         if self.views < 1:
             raise OptionError(f"--views is {self.views}; give at least 1")
         for name in ("hands", "objects", "stages", "protocols"):

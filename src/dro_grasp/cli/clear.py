@@ -63,6 +63,7 @@ class Clear:
         from dro_grasp.arm.clearing.trial import clear_trial
         from dro_grasp.arm.robots.loading import load_robot
         from dro_grasp.arm.tabletop.animation import FORMATS
+        from dro_grasp.arm.tabletop.experiment import require_mesh
         from dro_grasp.network.checkpoints import describe_weights
         from dro_grasp.objects.catalogue import load_object, resolve_objects
         from dro_grasp.predict.predictor import GraspPredictor
@@ -81,8 +82,11 @@ class Clear:
             tables, things = _counted(self.tables, "table"), _counted(count, "thing")
             raise OptionError(f"{tables} of {things} {'is' if self.tables == 1 else 'are'} asked for, of "
                               f"{_counted(len(names), 'object')}; give at least one table, and no more things than objects")
+        objects = [load_object(name) for name in names]
+        for obj in objects:
+            require_mesh(obj)
         config, robot = self._config(), load_robot(self.robot)
-        key = {"robot": robot.sha256, "objects": [load_object(name).sha256 for name in names], "things": count,
+        key = {"robot": robot.sha256, "objects": [obj.sha256 for obj in objects], "things": count,
                "seed": self.seed, "weights": describe_weights(self.weights)["sha256"], "settings": asdict(config)}
         known = _read(self.output, json.loads(json.dumps(key)))
         predictor = GraspPredictor(self.weights)
@@ -99,7 +103,7 @@ class Clear:
                     if not self.json:
                         _say(pick)
 
-                drawn = [load_object(names[i]) for i in _drawn(len(names), count, self.seed, number)]
+                drawn = [objects[i] for i in _drawn(len(names), count, self.seed, number)]
                 made = clear_trial(robot, drawn, number, self.seed, predictor, config, recorder, picked)
                 known[number] = asdict(made)
                 _append(self.output, {"table": number, **asdict(made), "key": key})
@@ -170,7 +174,7 @@ def _read(path: Path | None, key: dict[str, Any]) -> dict[int, dict[str, Any]]:
         return {}
     with reading(path, GraspFileError, "a file of cleared tables (.jsonl); name another one, or move this one away", *UNTYPED):
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        return {line["table"]: line for line in lines if line["key"] == key}
+        return {line.pop("table"): line for line in lines if line.pop("key") == key}
 
 
 def _counted(number: int, what: str) -> str:

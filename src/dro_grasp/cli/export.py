@@ -10,9 +10,9 @@ import tyro
 
 from dro_grasp.cli.evaluate import compare
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import print_json, say
+from dro_grasp.cli.output import folder_for, print_json, say
 from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.files import check_folder, check_output, free_name, make_folder, replacing
+from dro_grasp.files import check_output, free_name, make_folder, replacing
 from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Export:
         require_one_object(grasps, self.object, self.file)
         batches = dict(grasps.by_object())
         folder = form.file_per_grasp or len(batches) > 1
-        target = check_folder(self.output) if folder else check_output(self.output, form.suffix)
+        target = folder_for(self.output, form.suffix, len(batches)) if folder else check_output(self.output, form.suffix)
         if form.file_per_grasp:
             refuse_mixing(target, form.suffix)
         jobs = {name: self._job(batch, frame) for name, batch in batches.items()}

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from dro_grasp.cli.given_scene import SceneOptions, check_choice, find_thing
-from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, optional
-from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside, say_file
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, given_forces, optional
+from dro_grasp.cli.output import folder_for, print_json, print_table, progress_bar, say, say_aside, say_file
 from dro_grasp.cli.remote import generate_at, server_of
 from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
-from dro_grasp.errors import DroGraspError, OptionError, OutputError
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.extras import require_extra
-from dro_grasp.files import check_folder, check_output, free_name, given_path, make_folder
+from dro_grasp.files import check_output, free_name, given_path, make_folder, require_distinct
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ class Generate:
     refine: bool = True  # Refine the candidates on the object's geometry, near where the network proposed them.
     keep_table: Flag = False
     """Keep every point of a cloud. By default a table in it is found and cut off, and hands stay above it."""
-    temperature: Annotated[float | None, optional("T", "as the weights say")] = None
-    """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
+    temperature: Annotated[float | None, optional("T", "1; 0.5 for bare clouds")] = None
+    """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps, 2 the most."""
     mass: Mass = None  # Mass of the object [kg], which the grasps shall carry.
     least_confidence: Annotated[float | None, optional("P", "0.2; 0 with --no-refine")] = None
     """Grasps that hold with less probability are not returned; 0 returns all."""
@@ -171,6 +171,7 @@ class Generate:
     def check_scene(self) -> None:
         """Refuse options that contradict one another or the kind of object, by an OptionError."""
         check_choice(self)
+        require_distinct(picture=self.picture, scene_picture=self.seen.scene_picture)
         of_scene = self.seen.scene is not None
         if of_scene and self.keep_table:
             raise OptionError("--keep-table keeps a table that is in an object's own cloud; leave it out: the table of a scene "
@@ -183,6 +184,9 @@ class Generate:
             seen = " and ".join(["--scene"] * of_scene + ["--camera"] * (self.camera is not None))
             raise OptionError(f"{options} {verb} for a trial in simulation, and {what} is a bare point cloud, which gets none; "
                               f"leave out {options}, or give the object's mesh with --object and leave out {seen}")
+        if not self.refine and (idle := given_forces(self.constraints.margin, self.constraints.max_force)):
+            raise OptionError(f"{idle} {'say' if ' and ' in idle else 'says'} how hands squeeze once they settle, and with "
+                              "--no-refine none does; leave out one of them")
         if self.only_successful and self.protocol == "none":
             raise OptionError("--only-successful saves what passed a trial, and --protocol none asks for none; name a "
                               "--protocol, or leave --only-successful out")
@@ -376,10 +380,7 @@ def paths_per_object(path: Path | None, names: list[str], several: bool, suffix:
         return [None] * len(names)
     if not several:
         return [check_output(path, suffix)]
-    if path.suffix.lower() == suffix and not path.is_dir():
-        raise OutputError(f"{path} is the name of a file; for {len(names)} objects give that of a folder, such as "
-                          f"{path.with_suffix('')}")
-    path = check_folder(path)
+    path = folder_for(path, suffix, len(names))
     stems = [Path(name).stem for name in names]
     # mug.obj and mug.ply would overwrite each other's results.
     labels = list[str]()

@@ -47,6 +47,11 @@ def load_obstacle(name: str) -> ObjectModel:
             "inside; all else to stay clear of is given with --surroundings, a mesh or cloud of any size") from error
 
 
+def given_forces(margin: float | None, max_force: float | None) -> str:
+    """Which options of how hard hands squeeze are given, in words; empty for none."""
+    return " and ".join(name for name, value in (("--margin", margin), ("--max-force", max_force)) if value is not None)
+
+
 @dataclass(frozen=True)
 class PalmOptions:
     """Where palms point, how far hands open, and how hard they squeeze."""

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from dro_grasp.cli.switches import in_switches
+from dro_grasp.errors import OutputError
+from dro_grasp.files import check_folder
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
@@ -37,6 +39,14 @@ def say_file(what: str, path: object, aside: bool = False) -> None:
 def say_aside(text: str) -> None:
     """Print one line to stderr without wrapping."""
     stderr.print(in_switches(text), soft_wrap=True)
+
+
+def folder_for(path: Path, suffix: str, objects: int) -> Path:
+    """The folder for a file of each object; an OutputError where the path is the name of such a file."""
+    if path.suffix.lower() == suffix and not path.is_dir():
+        raise OutputError(f"{path} is the name of a file; for {objects} object{'s' if objects > 1 else ''} give that of a "
+                          f"folder, such as {path.with_suffix('')}")
+    return check_folder(path)
 
 
 def print_json(values: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOp
 from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside, say_file
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
-from dro_grasp.files import check_output, given_path, replacing
+from dro_grasp.files import check_output, given_path, replacing, require_distinct
 from dro_grasp.kinds import require_seed
 
 if TYPE_CHECKING:
@@ -117,6 +117,7 @@ class Plan:
         for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv"), (self.stages, ".yaml")):
             if path is not None:
                 check_output(path, ending)
+        require_distinct(trajectory=self.trajectory, stages=self.stages)
         if self.place is not None and self.place_on is not None:
             raise OptionError("--place and --place-on both say where to put the object; give one of them")
         if self.place is not None:
@@ -279,7 +280,16 @@ class Tabletop:
                 constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
-        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans, make)
+        made: list[Attempt] = []
+
+        def told(attempt: Attempt) -> None:
+            made.append(attempt)
+            if not self.json:
+                _say(attempt)
+
+        done = run_tabletop(run, self.output, self.workers, told, self.plans, make)
+        if self.plans is not None and len(done) > len(made):
+            say_aside(f"{len(done) - len(made)} of {len(done)} attempts are in --output already, and --plans gets none of them")
         self._report(done)
         if self.video is not None:
             draw_attempt(run, self.video)

@@ -211,3 +211,10 @@ def test_where_no_grasp_respects_the_constraints_the_plan_says_so(robot, standin
     wanted = dro.PlanConfig(num=2, batches=1, rehearsals=0, constraints=dro.Constraints(pregrasp_clearance=0.19))
     with pytest.raises(dro.DroGraspError, match=r"only 0 of \d+ candidates .* too close in pregrasp.* less pregrasp_clearance"):
         plan(robot, *standing, config=wanted)
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("rehearsals", -1), ("candidates", -1), ("closing_seconds", -1.0), ("grip_seconds", math.nan), ("best_seconds", math.inf)])
+def test_plans_of_impossible_numbers_are_refused(name: str, value: float) -> None:
+    with pytest.raises(OptionError, match=f"{name} is {value}; give"):
+        dro.PlanConfig(**{name: value})

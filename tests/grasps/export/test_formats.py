@@ -197,6 +197,8 @@ def test_several_objects_get_a_file_each(grasps: GraspBatch, tmp_path: Path, cap
     assert told["num"] == 3, "one has failed, one was not evaluated"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["can.csv", "mug.csv"]
     assert told["files"] == [str(tmp_path / "out" / name) for name in ("mug.csv", "can.csv")]
+    assert export(tmp_path / "all.parquet", "--format", "csv", "--output", tmp_path / "all.csv") == 2
+    assert "all.csv is the name of a file; for 2 objects give that of a folder" in capsys.readouterr().err
 
 
 def test_missing_pregrasps_are_made(grasps: GraspBatch, tmp_path: Path) -> None:

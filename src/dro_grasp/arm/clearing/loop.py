@@ -55,7 +55,8 @@ class Bin(Checked):
         """Refuse what is no box: OptionError."""
         super().__post_init__()
         if not (min(self.size) > 2 * WALL and self.height > 0 and np.isfinite([*self.centre, *self.size, self.height]).all()):
-            raise OptionError(f"the bin has size {self.size} and walls of {self.height} m; give metres above 0")
+            raise OptionError(f"the bin has centre {self.centre}, size {self.size} and walls of {self.height} m; give metres, "
+                              "of size and walls above 0")
 
     def holds(self, points: Float[np.ndarray, "n 3"], around: float = 0.0) -> Bool[np.ndarray, " n"]:
         """Which points are above it, or at most so far beside it [m], as seen from above."""

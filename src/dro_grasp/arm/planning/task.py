@@ -91,7 +91,7 @@ class PlanConfig(Checked):
         """Refuse what cannot be done.
 
         Raises:
-            OptionError: A number is not positive or not finite, or something is stated twice.
+            OptionError: A number is negative, or 0 where it must not be, or not finite, or something is stated twice.
         """
         super().__post_init__()
         if self.constraints.table is not None:
@@ -105,9 +105,12 @@ class PlanConfig(Checked):
             raise OptionError("there are no deviations to rehearse lifts with; give one at least, or rehearsals=0")
         if not 0 <= self.guess_clearance <= MAX_PREGRASP_CLEARANCE:
             raise OptionError(f"guess_clearance is {self.guess_clearance}; give metres from 0 to {MAX_PREGRASP_CLEARANCE:g}")
-        for name in ("num", "top", "rounds", "batches", "planner_seconds"):
+        for name in ("num", "top", "rounds", "batches", "candidates", "planner_seconds"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
+        for name in ("rehearsals", "best_seconds", "closing_seconds", "grip_seconds"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise OptionError(f"{name} is {getattr(self, name)}; give 0 or a number above it")
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,6 +97,8 @@ def run_tabletop(
         OutputError: `output` or `plans` cannot be written.
     """
     require_extra("arm")
+    if workers < 1:
+        raise OptionError(f"workers is {workers}; give at least 1")
     stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
     done, names = _done(run, stored, output)
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
