@@ -79,6 +79,29 @@ def test_the_very_name_comes_first(tmp_path: Path) -> None:
     assert not load_description(written(tmp_path, meshed("tip.stl"))).notes
 
 
+def test_a_mesh_is_that_of_the_package_it_names(tmp_path: Path) -> None:
+    """Not the one of the same name in the package of the file."""
+    name, other = "meshes/tip.stl", tmp_path / "arm" / "meshes" / "tip.stl"
+    tip(other)
+    mesh, path = tip(tmp_path / "gripper" / name), tmp_path / "arm" / "urdf"
+    path.mkdir()
+    assert find_mesh(f"package://gripper/{name}", path) == mesh
+    assert not load_description(written(path, meshed(f"package://gripper/{name}"))).notes
+    mesh.unlink()
+    assert find_mesh(f"package://gripper/{name}", path) == other
+    (told,) = load_description(written(path, meshed(f"package://gripper/{name}"))).notes
+    assert (told.level, told.subject) == ("warning", "gripper")
+    assert f"meshes are taken from {tmp_path / 'arm'}" in told.text
+    (tmp_path / "arm" / "package.xml").write_text("<package><name>gripper</name></package>")
+    assert not load_description(path / "claw.urdf").notes, "a package in a folder of another name"
+
+
+def test_a_mesh_that_is_not_in_the_folder_it_names_is_told(tmp_path: Path) -> None:
+    mesh = tip(tmp_path / "tip.stl")
+    (told,) = load_description(written(tmp_path, meshed("left/tip.stl"))).notes
+    assert (told.subject, told.text) == ("left/tip.stl", f"was not found, and {mesh} is taken for it")
+
+
 MJCF = ("<mujoco><compiler angle='radian' meshdir='meshes'/><asset><mesh name='tip' file='{}'/></asset><worldbody>"
         "<body name='palm'><geom type='box' size='.04 .04 .01'/><body name='left' pos='-.035 0 .01'>"
         "<joint name='a' axis='0 1 0' range='0 1.5'/>"

@@ -250,9 +250,8 @@ def _resolve_mesh(element: ET.Element, path: Path, files: dict[str, Path], notes
         return "was not found"
     if is_pointer(file):
         return NOT_FETCHED
-    if not any(os.path.isfile(candidate) for candidate in _candidates(name, path.parent)):
-        told = Note("warning", name, f"was not found, and {file} is taken for it")
-        notes.extend([] if told in notes else [told])
+    if (told := _found_elsewhere(name, file, path.parent)) is not None and told not in notes:
+        notes.append(told)
     # By MuJoCo; trimesh converts the others.
     readable = file.suffix.lower() in {".stl", ".obj", ".msh"} and not _is_unusual_stl(file)
     stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
@@ -297,13 +296,42 @@ def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
         notes.append(Note("warning", link.get("name", ""), "collides with its visual shapes instead"))
 
 
-def _candidates(name: str, folder: Path) -> list[Path]:
-    """Paths at which a mesh may lie, the most likely first; in URIs, %20 may stand for a space."""
+def _spellings(name: str) -> tuple[bool, tuple[str, ...]]:
+    """Whether a mesh's name is a URI, and its path; in URIs, %20 may stand for a space."""
     name = re.sub(r"^(?:file://)?\$\(find ([^)]*)\)", r"package://\1", name)  # what xacro would have replaced
     rest = name.replace("\\", "/").split("://", 1)[-1]
-    roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
-    tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
-    return [root / tail for root in roots for tail in tails]
+    return "://" in name, (rest, unquote(rest)) if "://" in name else (rest,)
+
+
+def _candidates(name: str, folder: Path) -> list[Path]:
+    """Paths at which a mesh may lie, the most likely first: in its package before any folder, which may be another's."""
+    is_uri, spellings = _spellings(name)
+    roots = (folder, *list(folder.parents)[:4]) if is_uri else (folder,)
+    tails = dict.fromkeys((*spellings, *(spelling.split("/", 1)[-1] for spelling in spellings)))
+    return [root / tail for tail in tails for root in roots]
+
+
+def _found_elsewhere(name: str, file: Path, folder: Path) -> Note | None:
+    """What to say of a mesh whose file has another spelling, or lies in a folder that is not the one, or package, it names."""
+    found = next((candidate for candidate in _candidates(name, folder) if os.path.isfile(candidate)), None)
+    is_uri, spellings = _spellings(name)
+    whole = [Path(spelling).parts for spelling in spellings]
+    if found is not None and any(found.parts[-len(parts):] == parts for parts in whole):
+        return None
+    if found is None or not is_uri:
+        return Note("warning", name, f"was not found, and {file} is taken for it")
+    package, root = whole[-1][0], found.parents[len(whole[-1]) - 2]
+    if _is_package(root, package):
+        return None
+    return Note("warning", package, f"is no folder near, and meshes are taken from {root}, which may be of another package")
+
+
+def _is_package(folder: Path, name: str) -> bool:
+    """Whether a folder says that it is a ROS package of this name."""
+    try:
+        return f"<name>{name}</name>" in (folder / "package.xml").read_text(errors="replace").replace(" ", "")
+    except OSError:
+        return False
 
 
 def mesh_of(name: str, path: Path) -> Path | None:
