@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
-from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
-from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.cli.output import print_result, progress_bar, records, say_aside, say_doubts
+from dro_grasp.errors import GraspFileError, HandError, OptionError
 from dro_grasp.files import check_folder, check_output, make_folder
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
@@ -60,6 +61,7 @@ class Synthesize:
 
     def run(self) -> int:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
+        from dro_grasp.hands.library import load_hand_description
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimize.contacts import ContactConfig
         from dro_grasp.optimize.synthesis import SynthesisConfig
@@ -70,6 +72,9 @@ class Synthesize:
         objects = resolve_objects(list(self.object))
         require_known(self.hand, objects)
         require_distinct(self.hand, objects)
+        for name in self.hand:
+            with suppress(HandError):  # told with its pairs
+                say_doubts(load_hand_description(name)[0])
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
             also=self.also, resettle=self.resettle, close_fingers=not self.keep_idle_fingers, confirm=self.confirm,

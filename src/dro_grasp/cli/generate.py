@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from dro_grasp.cli.given_scene import SceneOptions, check_choice, find_thing
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Mass, ProtocolName, given_forces, optional
-from dro_grasp.cli.output import folder_for, print_json, print_table, progress_bar, say, say_aside, say_file
+from dro_grasp.cli.output import folder_for, print_json, print_table, progress_bar, say, say_aside, say_doubts, say_file
 from dro_grasp.cli.remote import generate_at, server_of
 from dro_grasp.cli.start import load_libraries
 from dro_grasp.cli.switches import in_switches
@@ -105,6 +105,7 @@ class Generate:
 
         with progress_bar("loading libraries, hand and weights", self.json):
             names, outputs, pictures, job = self._prepare()
+        say_doubts(job.hand.description)
         several = names != [self._source]
         done, failed = [], []
         for part in self._parts(list(zip(names, outputs, pictures, strict=True))):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +16,9 @@ from rich.table import Table
 from dro_grasp.cli.switches import in_switches
 from dro_grasp.errors import OutputError
 from dro_grasp.files import check_folder
+
+if TYPE_CHECKING:
+    from dro_grasp.hands.description.loader import Description
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
@@ -47,6 +50,15 @@ def folder_for(path: Path, suffix: str, objects: int) -> Path:
         raise OutputError(f"{path} is the name of a file; for {objects} object{'s' if objects > 1 else ''} give that of a "
                           f"folder, such as {path.with_suffix('')}")
     return check_folder(path)
+
+
+def say_doubts(description: Description | None) -> None:
+    """Print to stderr, in a few lines, what is doubtful in a hand's file."""
+    from dro_grasp.hands.doubts import doubts
+
+    if description is not None:
+        for line in doubts(description):
+            say_aside(f"hand {description.name}: {line}")
 
 
 def print_json(values: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import tyro
 
 from dro_grasp.cli.given_scene import SceneOptions, check_choice, find_on_table, seen_from
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, Friction, Mass, PalmOptions, load_obstacle, optional
-from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside, say_file
+from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside, say_doubts, say_file
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, given_path, replacing, require_distinct
@@ -125,6 +125,7 @@ class Plan:
         if self.efforts and self.trajectory is None:
             raise OptionError("--efforts are written into the trajectory file; name one with --trajectory YAML")
         robot = load_robot(self.robot)
+        say_doubts(robot.hand.description)
         obstacles = [load_obstacle(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]

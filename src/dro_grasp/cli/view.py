@@ -14,7 +14,7 @@ import tyro
 from dro_grasp.cli.evaluate import compare, require_object
 from dro_grasp.cli.given_scene import ROBOT, seen_from
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import say_file
+from dro_grasp.cli.output import say_doubts, say_file
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output
@@ -283,11 +283,14 @@ class Serve:
         from dro_grasp.apps.server.answering import ServerConfig
         from dro_grasp.apps.server.http_server import Access, listening_socket, serve_grasps
         from dro_grasp.apps.server.request_queue import RequestQueue
+        from dro_grasp.hands.library import load_hand_description
 
         access = Access(self.host, self.token or os.environ.get(TOKEN), self.megabytes)
         with listening_socket(self.host, self.port) as listener:
             config = ServerConfig(self.weights, self.device, self.hand, self.object)
             queue = RequestQueue(config, self.queue, self.time_limit)
+            for name in self.hand:
+                say_doubts(load_hand_description(name)[0])
             host, port = listener.getsockname()[:2]
             print(f"grasp server: http://{f'[{host}]' if ':' in host else host}:{port}, requests at /docs (Ctrl-C stops it)",
                   file=sys.stderr, flush=True)

@@ -18,8 +18,9 @@ from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.closing import fixed_jaw_of
 from dro_grasp.hands.confidence import LOW, confidence, thumb_confidence
-from dro_grasp.hands.description.compiling import Note
+from dro_grasp.hands.description.compiling import Note, in_lines
 from dro_grasp.hands.description.loader import Description, named
+from dro_grasp.hands.doubts import only_drawn
 from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
@@ -64,11 +65,7 @@ class HandReport:
             first, *more = _words(value)
             told.append(f"{name.replace('_', ' '):<{width}}  {first}")
             told.extend(f"{'':<{width}}  {line}" for line in more)
-        alike: dict[tuple[str, str], list[str]] = {}
-        for note in self.notes:
-            alike.setdefault((note.level, note.text), []).append(note.subject)
-        found = [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
-        return [f"hand {self.hand.name}", *told, "", *(found or ["nothing wrong was found"])]
+        return [f"hand {self.hand.name}", *told, "", *(in_lines(self.notes) or ["nothing wrong was found"])]
 
     def to_dict(self) -> dict[str, Any]:
         """The report for programs."""
@@ -208,16 +205,13 @@ def _sliding_notes(hand: Hand) -> list[Note]:
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
-    notes = []
-    for link, name in enumerate(hand.tree.link_names):
-        if not bool(hand.tree.descends[link, hand.palm]):
-            continue
+    own = hand.tree.descends[:, hand.palm].nonzero()[:, 0].tolist()  # the palm and what hangs on it
+    notes = only_drawn(description, own)
+    for link in own:
         shapes = [g for g in description.geometry if g.link == link]
-        if shapes and not any(g.collides for g in shapes):
-            notes.append(Note("warning", name, "has a visual but no collision shape; it cannot touch anything"))
         volume = sum(abs(enclosed_volume(g.vertices[g.faces])) for g in shapes)
         if shapes and volume < THIN_VOLUME:
-            notes.append(Note("warning", name, "has shapes without volume"))
+            notes.append(Note("warning", hand.tree.link_names[link], "has shapes without volume"))
     few = [hand.tree.link_names[i] for i in hand.link_index.unique().tolist() if not bool(hand.registrable[i])]
     return [*notes, *(Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,6 +220,14 @@ class Note:
     level: Literal["info", "warning", "error"]
     subject: str  # the link, joint or file concerned
     text: str
+
+
+def in_lines(notes: Iterable[Note]) -> list[str]:
+    """Notes for people; those of one level in the same words are one line."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for note in notes:
+        alike.setdefault((note.level, note.text), []).append(note.subject)
+    return [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
 
 
 def collide(model: mujoco.MjModel, data: mujoco.MjData) -> None:
