@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -303,3 +304,20 @@ def test_a_thumb_that_opens_to_the_wrist_is_told(tmp_path: Path, farthest: float
     report = checked(tmp_path, text)
     assert report.facts["open_posture"]["thumb_swing"] == pytest.approx(farthest, abs=0.01)
     assert [subject.subject for subject in report.notes if "towards the wrist" in subject.text] == ["thumb2"] * told
+
+
+SLIDES = robot(block("palm", "0.12 0.06 0.04"), sliding("one", "1 0 0", 0.0, 0.04, at="0.01 0 0.02"),
+               sliding("other", "-1 0 0", 0.0, 0.04, at="-0.01 0 0.02"))
+
+
+@pytest.mark.parametrize(("text", "faced"), [
+    (SLIDES, (0, 0, 1)), (jaws(), (0, 0, 1)), (ring(3), (0, 0, 1)), (human(), (1, 0, 0))], ids=["slides", "jaws", "ring", "human"])
+def test_a_palm_without_shape_faces_where_its_fingers_say(tmp_path: Path, text: str, faced: tuple[float, float, float]) -> None:
+    whole = check_hand(written(tmp_path, text, "whole.urdf"))
+    bare = re.sub(r'<link name="palm">.*?</link>', '<link name="palm"/>', text, count=1)
+    found = check_hand(written(tmp_path, bare, "bare.urdf"))
+    assert np.dot(found.facts["palm_direction"], faced) > 0.9
+    assert float((found.hand.grasp_centre_wrist - whole.hand.grasp_centre_wrist).norm()) < 0.04
+    assert found.facts["opening_signs"] == whole.facts["opening_signs"]
+    assert whole.facts["confidence"]["palm"] > LOW > found.facts["confidence"]["palm"]
+    assert any(note.subject == "palm" and "its link has no shape" in note.text for note in found.notes)

@@ -45,6 +45,7 @@ WELL_ENCLOSED = 0.04  # Score of a palm above which no earlier closing is looked
 MUCH_BETTER = 0.01
 """How much better a palm must be for that it is found at an earlier closing [m] (ours). Grippers with such limits gain 0.014 to
 0.02, D'Claw 0.003."""
+STAND_IN = 64  # Points that stand for a palm without shape (ours)
 FACE_POINTS = 16  # Number of palm samples nearest to the grasp centre that make up the palm's inner face (ours)
 NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, so nothing can be grasped; check the origins, "
                     "axes and limits of its joints")
@@ -467,8 +468,24 @@ class ClosingFinder:
         return FingerMotion(self.tree, self.fingers, middles)
 
     @cached_property
+    def stand_in(self) -> tuple[Points, Points] | None:
+        """Points [m] and normals in place of a palm without shape: between the knuckles, towards the tips; None of others.
+
+        Where fingers begin to close alike, as those of flat hands, it faces where they close to.
+        """
+        if not self.on_palm.all():
+            return None
+        knuckles = self.motion.knuckles(self.start, self.movable).double().numpy()
+        tips = self.motion.tips((self.tree.lower + self.tree.upper) / 2).double().numpy()
+        faced = _unit(tips.mean(0) - knuckles.mean(0)) if self.sweep is None else self.sweep
+        points = np.random.default_rng(0).dirichlet(np.ones(len(knuckles)), STAND_IN) @ knuckles
+        return points, np.broadcast_to(faced, points.shape)
+
+    @cached_property
     def palm_middle(self) -> Point:
         """Mean of the palm's samples [m]."""
+        if self.stand_in is not None:
+            return _tensor(self.stand_in[0].mean(0))
         return _tensor(self.coarse.posed(self.tree, self.rest)[0][self.on_palm].mean(0))
 
     def out_of_palm(self, opened: Joints, signs: Joints, palm: Palm) -> JointMask:
@@ -485,7 +502,8 @@ class ClosingFinder:
         if jaw is not None:
             on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
         posed = [self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share)) for share in self.closings]
-        parts = [(points[on_palm], normals[on_palm], [points[mask] for mask in on_fingers]) for points, normals in posed]
+        parts = [(*(self.stand_in or (points[on_palm], normals[on_palm])), [points[mask] for mask in on_fingers])
+                 for points, normals in posed]
         best = max((find_palm(*part) for part in parts), key=lambda palm: palm.score)
         if jaw is not None:
             return dataclasses.replace(best, direction=jaw.direction)

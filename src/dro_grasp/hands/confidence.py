@@ -16,6 +16,7 @@ from dro_grasp.hands.opening import FingerMotion, guessed_side
 
 LOW = 0.6  # Confidence below which `hand check` warns (ours); palms and thumbs of 16 hands that are read right have more
 GUESS = 0.3  # Confidence in the palm's side of a flat hand that closes to either side alike (ours)
+NO_PALM = 0.5  # Confidence in the palm of a hand whose palm has no shape, at most (ours)
 NEARER = 0.005  # How much nearer to the grasp centre a fingertip must come for that it closes [m] (ours)
 BEFORE = 0.01  # How far behind the palm's face fingertips of the half-closed hand may be [m] (ours)
 SHARES = 9  # Postures from open to closed at which fingertips are looked for (ours)
@@ -42,6 +43,8 @@ def palm_cues(hand: Hand, description: Description) -> list[Cue]:
     cues = [Cue(sum(told) / len(told) if told else 1.0, "neither limits nor other fingers tell to which side fingers close"),
             Cue(float(coming.mean()), "fingers come nearer neither to each other nor to the middle of what the hand encloses"),
             Cue(float(ahead.mean()), "fingertips of the half-closed hand are behind the palm")]
+    if finder.stand_in is not None:
+        cues.append(Cue(NO_PALM, "its link has no shape, and is taken to face where fingers point, or begin to close; give it one"))
     if finder.sweep is not None:
         along = float(hand.palm_direction_wrist @ torch.from_numpy(finder.sweep).float())
         cues.append(Cue(max(0.0, along), "fingers begin to close in another direction than the palm faces"))
