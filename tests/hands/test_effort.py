@@ -79,6 +79,20 @@ def test_actuators_of_an_mjcf_state_the_effort_of_their_joint(tmp_path: Path, ac
     assert np.isnan(told["knuckle0"])
 
 
+@pytest.mark.parametrize(("stated", "expected"), [("-0.5 0.5", 0.5), ("-4 4", 0.7)])
+def test_a_joint_is_as_strong_as_the_weaker_of_itself_and_its_actuator(tmp_path: Path, stated: str, expected: float) -> None:
+    text = claw_xml().replace('actuatorfrcrange="-0.001 0.001"', f'actuatorfrcrange="{stated}"').replace(
+        "</mujoco>", "<actuator><position joint='base0' forcerange='-0.7 0.7'/></actuator></mujoco>")
+    (tmp_path / "hand.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1e6
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.qfrc_actuator).max() == pytest.approx(expected)
+    hand = load_hand(tmp_path / "hand.xml")
+    assert dict(zip(hand.tree.joint_names, hand.description.efforts.tolist(), strict=True))["base0"] == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("coefs", [(1.0, 1.0), (1.0, -2.0), (0.5, 2.0)])
 def test_the_leader_of_joints_on_a_tendon_does_the_work_of_all(tmp_path: Path, coefs: tuple[float, float]) -> None:
     """Oracle: virtual work of MuJoCo's own forces at both joints, as one length of the tendon moves them."""

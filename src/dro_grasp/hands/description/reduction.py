@@ -323,8 +323,15 @@ def _limit_joints_as_actuators(spec: mujoco.MjSpec) -> None:
             shares = {w.target.name: len(wraps) * abs(w.coef * actuator.gear[0]) for w in wraps}
         for name, share in shares.items():
             if name in joints and share and joints[name].actfrclimited != mujoco.mjtLimited.mjLIMITED_TRUE:
+                most = min(share * force, _stated_effort(joints[name]))
                 joints[name].actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
-                joints[name].actfrcrange = [-share * force, share * force]
+                joints[name].actfrcrange = [-most, most]
+
+
+def _stated_effort(joint: mujoco.MjsJoint) -> float:
+    """Largest effort that a joint states without saying that it is limited [N or Nm]; infinite where it states none."""
+    auto = joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_AUTO and joint.actfrcrange[0] < joint.actfrcrange[1]
+    return float(np.abs(joint.actfrcrange).max()) if auto else math.inf
 
 
 def _largest_force(actuator: mujoco.MjsActuator) -> float:
