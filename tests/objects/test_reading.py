@@ -50,8 +50,8 @@ def test_one_side_alone_is_asked_about(tmp_path: Path):
 
 
 def test_given_normals_are_kept_and_not_scaled(tmp_path: Path):
-    normals = directions(500, 1)
-    np.save(tmp_path / "c.npy", np.concatenate([40 * directions(500), 3 * normals], 1))
+    normals = directions(500)
+    np.save(tmp_path / "c.npy", np.concatenate([40 * normals, 3 * normals], 1))
     obj = load_file(tmp_path / "c.npy", scale=0.001)
     assert obj.extents.max() < 0.081
     assert "estimated" not in obj.notes[0]
@@ -267,6 +267,17 @@ def test_other_normals_of_a_ply_cloud_are_estimated_and_it_is_said(tmp_path: Pat
     assert ((obj.cloud / 0.04) * obj.cloud_normals).sum(1).min() > 0.9
     assert "normals were estimated" in obj.notes[0]
     assert any("were not used" in note for note in obj.notes)
+
+
+def test_normals_of_arrays_are_judged_as_those_of_files() -> None:
+    points, normals = bowl(3000)
+    turned = load_object(np.hstack([points, -normals]))
+    np.testing.assert_allclose(turned.cloud_normals, normals[KDTree(points).query(turned.cloud)[1]], atol=1e-5)
+    assert "its normals pointed inward and were turned" in turned.notes
+    ball, some = 0.04 * directions(2000), np.random.default_rng(1).choice([-1, 1], (2000, 1))
+    mixed = load_object(np.hstack([ball, ball / 0.04 * some]))
+    assert ((mixed.cloud / 0.04) * mixed.cloud_normals).sum(1).min() > 0.9
+    assert "its normals point to both sides of one surface, so they were not used" in mixed.notes
 
 
 def test_normals_of_a_thin_sheet_point_to_both_sides(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) 
     geometry = geometry_in_memory(source)
     if isinstance(geometry, trimesh.Trimesh):
         return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale)
-    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale, keep_table=keep_table)
+    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale, keep_table=keep_table, named_normals=False)
 
 
 def mesh_object(
@@ -97,12 +97,13 @@ def mesh_object(
 
 def cloud_object(
     name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False,
-    seen: Float[np.ndarray, "m 3"] | None = None, named_normals: bool = False,
+    seen: Float[np.ndarray, "m 3"] | None = None, named_normals: bool | None = None,
 ) -> ObjectModel:
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6), organised or not; only the points are scaled.
 
     `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
-    `named_normals` judges the normals that a file calls so: they are turned or estimated where they are no outward ones.
+    Normals are kept where `named_normals` is None. Else they are turned or estimated where they are no outward ones; False tells
+    that nothing calls columns 4 to 6 normals.
     """
     refuse_image(points, origin)
     points = in_rows(points)
@@ -156,7 +157,7 @@ def dropped_note(count: int, total: int) -> str:
 
 
 def given_normals(
-    cloud: Float[np.ndarray, "n 3"], given: Num[np.ndarray, "n k"], origin: str, named: bool
+    cloud: Float[np.ndarray, "n 3"], given: Num[np.ndarray, "n k"], origin: str, named: bool | None
 ) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
     """Unit normals as they were given, turned if they are inward all over; None to estimate them. And what to say."""
     if given.shape[1] != 3:
@@ -173,7 +174,7 @@ def given_normals(
     if not unit:
         return None, ("its normals have not all one length, so they were not used",)
     normals = given / length
-    if not named:
+    if named is None:
         return normals, ()
     if _contradict(cloud, normals):
         return None, ("its normals point to both sides of one surface, so they were not used",)
