@@ -311,7 +311,8 @@ SLIDES = robot(block("palm", "0.12 0.06 0.04"), sliding("one", "1 0 0", 0.0, 0.0
 
 
 @pytest.mark.parametrize(("text", "faced"), [
-    (SLIDES, (0, 0, 1)), (jaws(), (0, 0, 1)), (ring(3), (0, 0, 1)), (human(), (1, 0, 0))], ids=["slides", "jaws", "ring", "human"])
+    (SLIDES, (0, 0, 1)), (jaws(), (0, 0, 1)), (ring(3), (0, 0, 1)), (human(), (1, 0, 0))],
+    ids=["slides", "jaws", "ring", "human"])
 def test_a_palm_without_shape_faces_where_its_fingers_say(tmp_path: Path, text: str, faced: tuple[float, float, float]) -> None:
     whole = check_hand(written(tmp_path, text, "whole.urdf"))
     bare = re.sub(r'<link name="palm">.*?</link>', '<link name="palm"/>', text, count=1)

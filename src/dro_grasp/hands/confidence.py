@@ -44,7 +44,7 @@ def palm_cues(hand: Hand, description: Description) -> list[Cue]:
             Cue(float(coming.mean()), "fingers come nearer neither to each other nor to the middle of what the hand encloses"),
             Cue(float(ahead.mean()), "fingertips of the half-closed hand are behind the palm")]
     if finder.stand_in is not None:
-        cues.append(Cue(NO_PALM, "its link has no shape, and is taken to face where fingers point, or begin to close; give it one"))
+        cues.append(Cue(NO_PALM, "its link has no shape; it is taken to face where fingers point, or begin to close"))
     if finder.sweep is not None:
         along = float(hand.palm_direction_wrist @ torch.from_numpy(finder.sweep).float())
         cues.append(Cue(max(0.0, along), "fingers begin to close in another direction than the palm faces"))

@@ -102,8 +102,8 @@ def cloud_object(
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6), organised or not; only the points are scaled.
 
     `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
-    Normals are kept where `named_normals` is None. Else they are turned or estimated where they are no outward ones; False tells
-    that nothing calls columns 4 to 6 normals.
+    Normals are kept where `named_normals` is None; else they are turned or estimated where they are no outward ones. False:
+    nothing calls columns 4 to 6 normals.
     """
     refuse_image(points, origin)
     points = in_rows(points)

@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
+from dro_grasp.errors import HandError
 from dro_grasp.hands.description.compiling import LEAST_MASS, Note, compile_hand
 from dro_grasp.hands.description.reduction import CONTINUOUS_LIMIT, keep_hand_only
 
@@ -29,6 +30,25 @@ def test_the_hand_alone_is_left_at_the_origin() -> None:
     assert model.body("palm").quat.tolist() == [1, 0, 0, 0]
     assert model.jnt_range[0].tolist() == pytest.approx([-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT])
     assert {note.subject for note in notes} == {"table", "bend"}
+
+
+def tree(name: str, *joints: str) -> str:
+    """A body of the world on which one hangs for each joint."""
+    return f"<body name='{name}'><geom size='.02'/>" + "".join(
+        f"<body name='{joint}_link'><joint name='{joint}'/><geom size='.01'/></body>" for joint in joints) + "</body>"
+
+
+@pytest.mark.parametrize("other", [("c", "d"), ("drawer_1", "drawer_2", "drawer_3")])
+def test_two_trees_that_move_in_branches_are_told(other: tuple[str, ...]) -> None:
+    """A second hand, or a cabinet with more joints."""
+    with pytest.raises(HandError, match=r"has 2 trees of bodies.*: scene\.xml#one, scene\.xml#two$"):
+        reduced(tree("one", "a", "b") + tree("two", *other))
+
+
+def test_a_hand_branches_although_something_else_has_more_joints() -> None:
+    lamp = tree("lamp", "first").replace("</body></body>", "<body><joint/><geom size='.1'/><body><joint/><geom size='.1'/>")
+    spec, _ = reduced(lamp + "</body>" * 4 + tree("palm", "a", "b"))
+    assert [body.name for body in spec.bodies] == ["world", "palm", "a_link", "b_link"]
 
 
 def test_links_without_mass_get_some() -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import HandError
+from dro_grasp.hands.description.body_trees import hand_tree
 from dro_grasp.hands.description.compiling import MAX_JOINTS, MAX_LENGTH, MAX_TURN, Note, compile_hand
 from dro_grasp.hands.description.tendon_limits import tie_by_limits
 
@@ -33,14 +34,14 @@ SLIDE_LIMIT = 0.05  # Limits of slides that state none, both ways from zero [m] 
 
 
 def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False) -> tuple[Note, ...]:
-    """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
+    """Reduce a file, in place, to its hand, or else its largest articulated body tree, with its root at identity.
 
     Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
-    HandError: nothing moves, a joint within the hand is free, or one follows itself.
+    HandError: nothing moves, several trees may be the hand, a joint within the hand is free, or one follows itself.
     """
     notes: list[Note] = []
     _refuse_self_ties(spec, path)
-    hand = _largest_tree(spec, path)
+    hand = hand_tree(spec, path, fixed_base)
     named = _name_everything(spec)
     driven = driven_joints(spec)
     _limit_joints_as_actuators(spec)
@@ -131,16 +132,6 @@ def _split_balls(spec: mujoco.MjSpec, driven: set[str], path: Path, notes: list[
             passive.update(names)
         notes.append(Note("info", name, f"is a ball joint, taken as three hinges, {', '.join(names)}"))
     return passive
-
-
-def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
-    roots = list(spec.worldbody.bodies)
-    if not roots:
-        raise HandError(f"{path} has no body; expected a hand with moving joints")
-    counts = [sum(j.type != mujoco.mjtJoint.mjJNT_FREE for j in r.find_all("joint")) for r in roots]
-    if max(counts) == 0:
-        raise HandError(f"{path} has no moving joint; a hand needs at least one revolute or prismatic joint")
-    return roots[counts.index(max(counts))]
 
 
 def _name_everything(spec: mujoco.MjSpec) -> list[Note]:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.hands.description.body_trees import branches
 from dro_grasp.hands.description.compiling import Note, compiled, mujoco_speaks_to
 
 APART = 0.4  # Largest distance between the bases of two fingers of a hand [m] (ours)
@@ -46,12 +47,10 @@ def _is_finger(body: mujoco.MjsBody) -> bool:
 
 def _branches(body: mujoco.MjsBody, spec: mujoco.MjSpec) -> bool:
     """Whether a child of the world is a hand by itself: parts of it move in branches that no tie closes."""
-    moving = [b for b in (body, *body.find_all("body")) if list(b.joints)]
-    last = [b for b in moving if not any(list(below.joints) for below in b.find_all("body"))]
     inside = {b.name for b in (body, *body.find_all("body"))}
     tied = any(e.name1 in inside for e in spec.equalities if e.type in {
         mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and e.objtype == mujoco.mjtObj.mjOBJ_BODY)
-    return len(last) > 1 and not tied
+    return branches(body) and not tied
 
 
 def _flattened(spec: mujoco.MjSpec) -> mujoco.MjModel:
