@@ -54,7 +54,13 @@ def test_scene_is_merged_with_its_transforms(tmp_path: Path):
     obj = load_file(tmp_path / "two.glb")
     assert obj.volume == pytest.approx(2 * 8e-6, rel=1e-4)
     assert obj.extents[0] == pytest.approx(0.07, abs=1e-6)
-    assert obj.notes == ("2 separate bodies",)
+    (told,) = obj.notes
+    assert told.startswith("2 separate bodies, up to 3 cm apart, count as one rigid object")
+
+
+def test_bodies_that_touch_or_nearly_do_are_one_thing(tmp_path: Path) -> None:
+    balls = [sphere(0.02, (0.041 * number, 0, 0)) for number in range(3)]
+    assert load_file(save(trimesh.util.concatenate(balls), tmp_path / "chain.ply")).notes == ("3 separate bodies",)
 
 
 def test_overlapping_bodies_are_joined(tmp_path: Path):
@@ -135,6 +141,21 @@ def test_open_shell_keeps_its_volume_and_outside(tmp_path: Path, inverted: bool)
     expected = 2 / 5 * obj.volume * 0.03**2
     np.testing.assert_allclose(np.diag(obj.inertia), expected, rtol=0.1)
     assert ((obj.cloud - (0.3, 0.2, 0)) * obj.cloud_normals).sum(1).mean() > 0.02
+
+
+@pytest.mark.parametrize("cut", [0.0, -0.02, 0.025])
+def test_a_bowl_without_thickness_is_told_to_be_solid(tmp_path: Path, cut: float) -> None:
+    bowl = sphere().slice_plane((0, 0, cut), (0, 0, -1))
+    obj = load_file(save(bowl, tmp_path / "bowl.ply"))
+    assert any("so it is solid here; if it is hollow" in note for note in obj.notes)
+
+
+def test_a_box_without_lid_is_told_to_be_solid_and_small_holes_are_not(tmp_path: Path) -> None:
+    box, ball = trimesh.creation.box((0.06, 0.06, 0.06)), sphere()
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    ball.update_faces(np.arange(len(ball.faces)) % 7 != 0)
+    assert "so it is solid here" in load_file(save(box, tmp_path / "box.ply")).notes[0]
+    assert load_file(save(ball, tmp_path / "ball.ply")).notes == ("holes were closed",)
 
 
 def test_bent_sheet_weighs_as_its_hull(tmp_path: Path):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Num
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import KDTree, QhullError
 
 from dro_grasp.errors import ObjectError, UngraspableError
@@ -289,6 +290,14 @@ OUTSIDE = 0.25  # Winding number up to which a place is surely outside [1] (ours
 ENCLOSED = (0.2, 0.8)
 """What an open mesh encloses (ours): places surely inside, over those not surely outside, and places more inside than
 outside, over its convex hull. With less than both it is a sheet: two sides of a box have 0 and 0.4, a tray has 0.05 and 1."""
+WIDE = 0.05
+"""Share of a mesh's area from which on what it leaves open is no small hole (ours): half a ball has 0.5, a cup 0.17, a glass
+0.1, a bottle 0.02."""
+AS_SOLID = ("not watertight: its opening counts as closed, so it is solid here; if it is hollow, as a bowl or cup is, give its "
+            "wall a thickness")
+"""What to say of a mesh with a wide opening."""
+FAR_APART = 0.005  # Gap between bodies of one mesh from which on they look like several things [m] (ours)
+MOST_LINKED = 1000  # Bodies of one mesh beyond which no gaps between them are looked for (ours)
 OVERLAP = 1e-3  # Share of the volume by which bodies may overlap without being joined (ours)
 
 MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
@@ -354,9 +363,11 @@ def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     if (before := len(mesh.faces)) > 100_000:  # (ours)
         mesh = mesh.simplify_quadric_decimation(face_count=50_000)
         notes.append(f"decimated from {before} to {len(mesh.faces)} faces")
-    if not mesh.is_watertight:
-        _close(mesh, notes)
-    if _turn_outward(mesh):
+    own, closed = len(mesh.faces), "" if mesh.is_watertight else _close(mesh)
+    turned = _turn_outward(mesh)
+    if closed:
+        notes.append(AS_SOLID if _opening(mesh.triangles[:own]) > WIDE else closed)
+    if turned:
         notes.append("faces were turned outward")
     return _join(mesh, notes)
 
@@ -379,16 +390,22 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
     return _of_solid(hull)
 
 
-def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+def _close(mesh: trimesh.Trimesh) -> str:
+    """Close small holes, in place; returns what to say."""
     before = len(mesh.faces)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     if mesh.is_watertight:
-        notes.append(f"{before - len(mesh.faces)} repeated faces or faces without area were left out")
-        return
+        return f"{before - len(mesh.faces)} repeated faces or faces without area were left out"
     trimesh.repair.fill_holes(mesh)
-    notes.append("holes were closed" if mesh.is_watertight else
-                 "not watertight: distances use winding numbers, which cope with small holes")
+    return "holes were closed" if mesh.is_watertight else (
+        "not watertight: distances use winding numbers, which cope with small holes")
+
+
+def _opening(triangles: Float[np.ndarray, "n 3 3"]) -> float:
+    """Area of what faces that are wound alike leave open to one side, as a share of theirs [1]: of a closed surface none."""
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return float(np.linalg.norm(areas.sum(0)) / np.linalg.norm(areas, axis=1).sum())
 
 
 def _turn_outward(mesh: trimesh.Trimesh) -> bool:
@@ -426,7 +443,9 @@ def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     if not mesh.is_watertight or mesh.body_count == 1:
         return mesh
     bodies = list(mesh.split(only_watertight=False))
-    notes.append(f"{len(bodies)} separate bodies")
+    apart = _apart(np.array([body.bounds for body in bodies])) if len(bodies) <= MOST_LINKED else 0.0
+    notes.append(f"{len(bodies)} separate bodies" + ("" if apart < FAR_APART else (
+        f", up to {apart * 100:.2g} cm apart, count as one rigid object; if they are several things, give each its own file")))
     if not all(_is_solid(body) for body in bodies):
         return mesh
     joined = trimesh.boolean.union(bodies, engine="manifold")
@@ -434,6 +453,13 @@ def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         return mesh
     notes[-1] = f"{len(bodies)} overlapping bodies were joined"
     return joined
+
+
+def _apart(boxes: Float[np.ndarray, "n 2 3"]) -> float:
+    """The widest gap [m] on the shortest ways that link all boxes, each of which has a lower and an upper corner."""
+    gaps = np.maximum(boxes[:, None, 0] - boxes[None, :, 1], boxes[None, :, 0] - boxes[:, None, 1]).clip(0)
+    # Without an entry two bodies are not linked, and bodies that touch are.
+    return float(minimum_spanning_tree(np.linalg.norm(gaps, axis=-1) + 1e-9).data.max(initial=0))
 
 
 def _volume(mesh: trimesh.Trimesh) -> float:
