@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -22,6 +23,7 @@ from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.hands.variants import vary_hand
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.claw_urdf import claw, joint, link, written
+from tests.helpers.strange_hands import human
 from tests.helpers.whole_robot import arm_with_claw, two_arms
 
 LEFT = ("left_palm", "left_one", "left_other")
@@ -116,6 +118,22 @@ def test_arm_with_a_single_jaw_is_refused_and_the_jaw_is_a_hand(tmp_path: Path) 
     with pytest.raises(HandError, match=r"arm\.urdf: its fingertip 'jaw' is 0\.64 m .*an arm;.* arm\.urdf#lower$"):
         load_hand(path)
     assert load_hand(f"{path}#lower").tree.joint_names == ("grip",)
+
+
+@pytest.mark.parametrize(("factor", "told"), [
+    (4.0, r"is 0\.\d+ m .*; name the link at which the hand begins: hand\.urdf#palm for all of it, or for example"),
+    (100.0, r"looks like centimetres: scale its origins, shapes and meshes by 0\.01; or these are arms")])
+def test_a_hand_of_another_size_is_told_that_it_may_be_one(tmp_path: Path, factor: float, told: str) -> None:
+    def larger(match: re.Match[str]) -> str:
+        return match[1] + " ".join(str(float(x) * factor) for x in match[2].split()) + '"'
+
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    text = re.sub(r'((?:size|<origin xyz)=")([^"]*)"', larger, human().replace("</link>", mass))
+    path = written(tmp_path, text, "hand.urdf")
+    with pytest.raises(HandError, match=told):
+        load_hand(path)
+    if factor < 10:
+        assert len(load_hand(f"{path}#palm").fingers) == 5
 
 
 def test_arms_with_a_single_jaw_each_are_refused_before_their_palm_is_looked_for(

@@ -19,6 +19,7 @@ from dro_grasp.geometry.point_clouds import farthest_points, sample_surface
 from dro_grasp.hands import anatomy
 from dro_grasp.hands.anatomy import Finger, fixed_below, path_to
 from dro_grasp.hands.closing import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED, Closing, ClosingFinder
+from dro_grasp.hands.description.compiling import HAND, likely_unit
 from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.description.tree_reading import LinkGeometry
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
@@ -226,9 +227,10 @@ class HandBuilder:
         surface = sample_links(self.description, [link for link in self.links if link in self.shaped], self.seed)
         size = float(np.ptp(surface.posed(self.tree, self.rest)[0], axis=0).max())
         if size > LARGEST_HAND:
-            whole = named(self.description.path.name, "LINK")
-            raise HandError(f"the hand is {size:.3g} m large, which looks like millimetres; expected metres: scale its "
-                            f"origins, shapes and meshes by 0.001; or, if this is a whole robot, give its hand: {whole}")
+            whole, (unit, scale) = named(self.description.path.name, "LINK"), likely_unit(size, HAND)
+            raise HandError(f"the hand is {size:.3g} m large, which looks like {unit}; expected metres: scale its shapes by "
+                            f'{scale:g}, meshes by scale="{scale:g} {scale:g} {scale:g}" in <mesh>, and its origins if '
+                            f"they are too large as well; or, if this is a whole robot, give its hand: {whole}")
         if size < SMALLEST_HAND:
             raise HandError(f"the hand is {size:.3g} m large, which looks like another unit than metres; expected "
                             f"{SMALLEST_HAND} to {LARGEST_HAND} m: scale its origins, shapes and meshes")
@@ -331,8 +333,11 @@ def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: 
     far = [tip for tip in tips if reach(tree, palm, tip) > longest]
     if far and not hands:
         carriers = [tree.parent[max(link for link in path_to(tree, tip) if tree.kind[link] != FIXED)] for tip in far]
-        given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MAX_NAMED]))
-        what = "this is an arm" if len(tips) == 1 else "these are arms or legs"
-        raise HandError(f"its fingertip '{tree.link_names[far[0]]}' is {reach(tree, palm, far[0]):.2g} m of links away from "
-                        f"'{tree.link_names[palm]}', so {what}; if a hand is part of it, name the link at which it begins, "
-                        f"for example {given}")
+        begin = [named(file, tree.link_names[link]) for link in dict.fromkeys([palm, *carriers[:MAX_NAMED]])]
+        way, what = reach(tree, palm, far[0]), "this is an arm" if len(tips) == 1 else "these are arms or legs"
+        unit, scale = likely_unit(way, HAND)
+        guess = f"so {what}" if way <= LARGEST_HAND else (
+            f"which looks like {unit}: scale its origins, shapes and meshes by {scale:g}; or {what}")
+        raise HandError(f"its fingertip '{tree.link_names[far[0]]}' is {way:.2g} m of links away from "
+                        f"'{tree.link_names[palm]}', {guess}; name the link at which the hand begins: {begin[0]} for all of it"
+                        + (f", or for example {' or '.join(begin[1:])}" if begin[1:] else ""))

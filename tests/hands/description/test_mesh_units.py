@@ -95,5 +95,12 @@ def test_collision_meshes_in_millimetres_beside_visual_ones_in_metres_are_left_o
 
 def test_meshes_in_millimetres_alone_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, claw(links=link("left", box_of(tmp_path, "large.stl", 0.001)) + link("right")))
-    with pytest.raises(HandError, match="this looks like millimetres"):
+    with pytest.raises(HandError, match=r'of mesh .* looks like millimetres: state scale="0\.001 0\.001 0\.001" where'):
         load_description(path)
+
+
+def test_meshes_in_centimetres_alone_are_refused(tmp_path: Path) -> None:
+    mass = '<inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>'
+    large = link("left", box_of(tmp_path, "large.stl", 0.01)).replace("</link>", f"{mass}</link>")
+    with pytest.raises(HandError, match=r'looks like centimetres; .* meshes by scale="0\.01 0\.01 0\.01" in <mesh>'):
+        load_hand(written(tmp_path, claw(links=large + link("right"))))

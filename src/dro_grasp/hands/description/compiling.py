@@ -30,9 +30,9 @@ TURNS = 1e4  # Largest reference angle [rad], and largest ratio or offset of a c
 HEAVIEST = 1e4  # Largest mass [kg] and inertia [kg m^2] (ours)
 NUMBERS = (
     ("link", "body_pos", "origin", MAX_LENGTH), ("link", "body_quat", "rotation", 2.0),
-    ("shape", "geom_pos", "origin", MAX_LENGTH), ("shape", "geom_quat", "rotation", 2.0),
-    ("shape", "geom_size", "size", MAX_LENGTH),
-    ("vertex", "mesh_vert", "vertex", MAX_LENGTH), ("joint", "jnt_pos", "anchor", MAX_LENGTH),
+    ("vertex", "mesh_vert", "vertex", MAX_LENGTH), ("shape", "geom_pos", "origin", MAX_LENGTH),
+    ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", MAX_LENGTH),
+    ("joint", "jnt_pos", "anchor", MAX_LENGTH),
     ("link", "body_ipos", "centre of mass", MAX_LENGTH), ("link", "body_mass", "mass", HEAVIEST),
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
     ("joint", "jnt_range", "limits", MAX_TURN), ("joint", "qpos0", "reference", TURNS),
@@ -40,7 +40,16 @@ NUMBERS = (
     ("site", "site_pos", "place", MAX_LENGTH), ("coupling", "eq_data", "coefficients", TURNS),
 )
 """Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
-masses, which MuJoCo derives from them where a file states none."""
+masses, which MuJoCo derives from them where a file states none, and vertices before the origins of shapes, to which it adds
+the middle of their mesh."""
+UNITS = {"millimetres": 0.001, "centimetres": 0.01}  # Units that hands have in place of metres [m]
+HAND = 0.15  # Usual length of fingers and of a hand [m] (ours)
+PART = 0.05  # Usual extent of a mesh of a hand [m] (ours)
+
+
+def likely_unit(size: float, usual: float) -> tuple[str, float]:
+    """The unit, and its length [m], in which something measures so much that usually has so many metres."""
+    return min(UNITS.items(), key=lambda unit: abs(math.log(size * unit[1] / usual)))
 
 
 @contextmanager
@@ -190,9 +199,12 @@ def _hint(what: str, values: Float[np.ndarray, " n"], largest: float) -> str:
     if not np.isfinite(values).all():
         return ""
     if what in {"mass", "inertia"}:
-        return "; if the file does not state it, its shapes are in another unit than metres: scale the file"
+        return "; if the file does not state it, its shapes are in another unit than metres: scale the file, or only its meshes"
     if what == "limits":
         return "; this looks like degrees: write radians, or leave the limits out where a joint has none"
+    if what == "vertex":
+        unit, scale = likely_unit(float(np.abs(values).max()), PART)
+        return f'; this looks like {unit}: state scale="{scale:g} {scale:g} {scale:g}" where the file names the mesh'
     return "; this looks like millimetres: scale the file by 0.001" if largest == MAX_LENGTH else ""
 
 
