@@ -62,7 +62,7 @@ def test_absurd_numbers_of_a_urdf_are_refused_by_name(tmp_path: Path, text: str,
     (mjcf(before='<asset><mesh name="m" builtin="supersphere" params="10000 1 1"/></asset>'), "divide it less"),
     (mjcf(ATTACHED.format("palm"), '<asset><model name="m" file="claw.xml"/></asset>'),
      "attaches 'claw.xml', which contains claw.xml itself"),
-    (mjcf(before='<asset><mesh name="m" file="/dev/zero"/></asset>'), "files of meshes or textures are missing"),
+    (mjcf(before='<asset><mesh name="m" file="/dev/zero"/></asset>'), "files of meshes are missing"),
     (mjcf(before=f'<include file="{"a" * 5000}.xml"/>'), "which does not exist"),
 ])
 def test_an_mjcf_that_grows_or_contains_itself_is_refused(tmp_path: Path, text: str, message: str) -> None:

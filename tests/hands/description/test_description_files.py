@@ -10,9 +10,10 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import HandError
+from dro_grasp.hands.description.compiling import read_mesh
 from dro_grasp.hands.description.loader import load_description
 from dro_grasp.hands.description.tree_reading import Coupling, resolve_couplings
-from dro_grasp.hands.description.urdf import as_obj, find_mesh, resolve_meshes
+from dro_grasp.hands.description.urdf import find_mesh, resolve_meshes
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from tests.helpers.claw_urdf import claw, joint, written
 
@@ -133,11 +134,10 @@ def test_lost_collision_meshes_give_way_to_visual_shapes(tmp_path):
     assert stand_in.endswith(".obj")
     assert root.find("link/collision/geometry/mesh").get("filename") == stand_in
     assert ["was not found" in n.text or "visual shapes" in n.text for n in notes] == [True, True]
-    again = trimesh.load(trimesh.util.wrap_as_stream(as_obj(tmp_path / "box.ply", [])), file_type="obj")
-    assert again.volume == pytest.approx(1e-3)
+    assert read_mesh(tmp_path / "box.ply", []).volume == pytest.approx(1e-3)
 
 
 def test_a_mesh_in_no_known_format_is_refused(tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"nonsense")
     with pytest.raises(HandError, match=r"bad\.glb cannot be read"):
-        as_obj(tmp_path / "bad.glb", [])
+        read_mesh(tmp_path / "bad.glb", [])

@@ -45,7 +45,7 @@ def test_a_hand_of_pointers_is_refused_with_the_reason(tmp_path: Path) -> None:
 
 def test_meshes_of_an_mjcf_and_descriptions_are_told_as_well(tmp_path: Path) -> None:
     written(tmp_path, POINTER, "tip.stl")
-    with pytest.raises(HandError, match=r"1 files of meshes or textures are pointers of Git LFS.*tip\.stl.*git lfs pull"):
+    with pytest.raises(HandError, match=r"1 files of meshes are pointers of Git LFS.*tip\.stl.*git lfs pull"):
         load_hand(written(tmp_path, MJCF, "hand.xml"))
     with pytest.raises(HandError, match=r"claw\.urdf is a pointer of Git LFS, not the hand; .*git lfs pull"):
         load_hand(written(tmp_path, POINTER))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -218,3 +219,42 @@ def test_an_mjcf_all_of_whose_joints_are_limited_to_one_value_is_refused(tmp_pat
 def test_limits_of_an_mjcf_that_do_not_count_are_told(tmp_path: Path, limits: str, told: str) -> None:
     text = RANGES.format(compiler=RADIAN, a=limits, b="range='0 1.5'")
     assert [note.text for note in load_description(written(tmp_path, text, "hand.xml")).notes] == [told]
+
+
+@pytest.mark.parametrize("kind", ["text.stl", "tip.dae", "tip.ply", "normals.obj"])
+def test_meshes_of_an_mjcf_that_mujoco_refuses_are_read(tmp_path: Path, kind: str) -> None:
+    box, file = trimesh.creation.box(SIZE), tmp_path / "meshes" / kind
+    file.parent.mkdir()
+    if kind == "text.stl":
+        file.write_text(trimesh.exchange.stl.export_stl_ascii(box))
+    elif kind == "normals.obj":  # of some corners alone
+        text = trimesh.exchange.obj.export_obj(box, include_normals=False)
+        file.write_text(re.sub(r"\nf (\d+) (\d+) (\d+)", r"\nvn 0 0 1\nf \1//1 \2//1 \3//1", text, count=1))
+    else:
+        box.export(file)
+    path = written(tmp_path, MJCF.format(kind), "hand.xml")
+    for part in (path, f"{path}#palm"):
+        description = load_hand(part).description
+        assert description is not None
+        left = description.tree.link_names.index("left")
+        sizes = [np.ptp(g.vertices, axis=0).round(5).tolist() for g in description.geometry if g.link == left]
+        assert sizes == [list(SIZE)]
+
+
+def test_a_urdf_may_have_normals_on_some_corners(tmp_path: Path) -> None:
+    text = trimesh.exchange.obj.export_obj(trimesh.creation.box(SIZE), include_normals=False)
+    written(tmp_path, re.sub(r"\nf (\d+) (\d+) (\d+)", r"\nvn 0 0 1\nf \1//1 \2//1 \3//1", text, count=1), "tip.obj")
+    assert len(load_hand(written(tmp_path, meshed("tip.obj"))).fingers) == 2
+
+
+def test_looks_cost_no_hand(tmp_path: Path) -> None:
+    """A texture that is not there, and a colour of three numbers."""
+    tip(tmp_path / "meshes" / "tip.stl")
+    looks = "<asset><texture name='t' type='2d' file='lost.png'/><material name='m' texture='t'/>"
+    mjcf = MJCF.format("tip.stl").replace("<asset>", looks).replace("<geom type='mesh'", "<geom material='m' type='mesh'")
+    plain = load_hand(written(tmp_path, MJCF.format("tip.stl"), "plain.xml"))
+    torch.testing.assert_close(load_hand(written(tmp_path, mjcf, "hand.xml")).link_points, plain.link_points)
+    colour = '<material name="white"><color rgba="1 1 1"/></material>'
+    urdf = claw(colour).replace("<visual>", f"<visual>{colour}")
+    torch.testing.assert_close(
+        load_hand(written(tmp_path, urdf)).link_points, load_hand(written(tmp_path, claw(), "plain.urdf")).link_points)

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import HandError
+from dro_grasp.files import reading
+from dro_grasp.geometry.mesh_files import open_mesh, trimesh
 
 LEAST_MASS = 1e-4  # Mass of moving links that state none, or a negative one [kg] (ours)
 LEAST_INERTIA = 1e-8  # Inertia of moving links that state none [kg m^2] (ours)
@@ -143,6 +145,9 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         if colliding:
             notes.append(Note("warning", mesh.name, "is a flat mesh, which cannot collide; it is only drawn"))
         return bool(colliding)
+    if "decoder" in message or "mesh_facenormal" in message:  # which does not say of which OBJ
+        refused = [mesh] if mesh is not None else [m for m in spec.meshes if m.file.lower().endswith(".obj")]
+        return any([_convert(mesh, notes) for mesh in refused])
     compiler = spec.compiler
     if "inertia of moving bodies" in message and compiler.boundmass < LEAST_MASS:
         compiler.boundmass, compiler.boundinertia = LEAST_MASS, LEAST_INERTIA
@@ -153,6 +158,14 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         notes.append(Note("warning", "inertia", "some links have impossible inertias, which are balanced"))
         return True
     return False
+
+
+def _convert(mesh: mujoco.MjsMesh, notes: list[Note]) -> bool:
+    """Give a mesh, in place, the vertices and faces that trimesh reads from its file; False if there are none."""
+    if not (file := Path(mesh.file)).is_file() or not len((found := read_mesh(file, notes)).faces):
+        return False
+    mesh.file, mesh.uservert, mesh.userface = "", np.asarray(found.vertices).ravel(), np.asarray(found.faces).ravel()
+    return True
 
 
 def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
@@ -240,6 +253,20 @@ def in_lines(notes: Iterable[Note]) -> list[str]:
     for note in notes:
         alike.setdefault((note.level, note.text), []).append(note.subject)
     return [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
+
+
+def read_mesh(file: Path, notes: list[Note]) -> trimesh.Trimesh:
+    """A mesh in any format trimesh reads, in metres; another unit that the file states is noted."""
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
+        loaded = open_mesh(file)
+        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        if not math.isclose(unit, 1.0):
+            mesh.apply_scale(unit)
+            told = Note("info", file.name, f"states that its unit is {unit:g} m, and is taken so")
+            notes.extend([] if told in notes else [told])
+        return mesh
 
 
 def collide(model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -22,13 +22,13 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
-from dro_grasp.geometry.mesh_files import FETCH, is_pointer
-from dro_grasp.hands.description.compiling import Note, collide, compile_hand, compiled, guess_unit, mujoco_speaks_to
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer, trimesh
+from dro_grasp.hands.description.compiling import Note, collide, compile_hand, compiled, guess_unit, mujoco_speaks_to, read_mesh
 from dro_grasp.hands.description.dialects import MOST_UNKNOWN, drop_unknown
 from dro_grasp.hands.description.inertials import lightened, mend_empty_inertials, mend_mjcf_inertials
 from dro_grasp.hands.description.reduction import NO_LIMITS, keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
-from dro_grasp.hands.description.urdf import CONTINUOUS, MOVING, as_obj, in_any_case, prepare_urdf
+from dro_grasp.hands.description.urdf import CONTINUOUS, MOVING, in_any_case, prepare_urdf
 from dro_grasp.hands.description.world_palm import with_palm_of_world
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
@@ -147,9 +147,14 @@ class Description:
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
     xml, files, converted = prepare_urdf(root, path, notes)
-    assets = {name: as_obj(file, notes) for name, file in converted.items()}
+    assets = {name: _as_obj(file, notes) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
         return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
+
+
+def _as_obj(file: Path, notes: list[Note]) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text in metres."""
+    return trimesh.exchange.obj.export_obj(read_mesh(file, notes), include_normals=False, include_texture=False).encode()
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
@@ -161,17 +166,17 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     mend_empty_inertials(spec, notes)
     if not any("angle" in c.attrib for tree in trees.values() for c in tree.iter("compiler")):
         notes.extend(guess_unit(spec))
-    _find_files(spec, path, notes)
-    folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
-    meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
-    used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
-    if pointers := sorted(str(file) for file in used if os.path.isfile(file) and is_pointer(file)):
-        raise HandError(f"{path}: {len(pointers)} files of meshes or textures are pointers of Git LFS (first: {pointers[0]}); "
-                        f"{FETCH}")
-    missing = sorted(str(file) for file in used if not os.path.isfile(file))
+    _drop_textures(spec)
+    _find_meshes(spec, path, notes)
+    meshes = {path.parent / (spec.meshdir or "") / mesh.file for mesh in spec.meshes if mesh.file}
+    if pointers := sorted(str(file) for file in meshes if os.path.isfile(file) and is_pointer(file)):
+        raise HandError(f"{path}: {len(pointers)} files of meshes are pointers of Git LFS (first: {pointers[0]}); {FETCH}")
+    missing = sorted(str(file) for file in meshes if not os.path.isfile(file))
     if missing:
-        raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
-                        "there or correct meshdir and texturedir")
+        raise HandError(f"{path}: {len(missing)} files of meshes are missing (first: {missing[0]}); put them there or correct "
+                        "meshdir")
+    for mesh in spec.meshes:  # a part of the file knows no meshdir
+        mesh.file = mesh.file and str((path.parent / (spec.meshdir or "") / mesh.file).absolute())
     return spec, (*included, *meshes)
 
 
@@ -185,16 +190,25 @@ def _with_included(root: ET.Element, path: Path) -> tuple[Path, tuple[Path, ...]
         return path.resolve(), included_files(root, path.resolve())
 
 
-def _find_files(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
-    """Point meshes and textures, in place, to files that lie beside a link's target or are spelled in another case."""
-    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
-        if not asset.file or os.path.isfile(path.parent / (folder or "") / asset.file):
+def _drop_textures(spec: mujoco.MjSpec) -> None:
+    """Delete, in place, textures, which nothing here draws: their files need not be there."""
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+
+
+def _find_meshes(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Point meshes, in place, to files that lie beside a link's target or are spelled in another case."""
+    folder = spec.meshdir or ""
+    for mesh in spec.meshes:
+        if not mesh.file or os.path.isfile(path.parent / folder / mesh.file):
             continue
-        likely = [parent / (folder or "") / unquote(asset.file) for parent in (path.parent, path.resolve().parent)]
+        likely = [parent / folder / unquote(mesh.file) for parent in (path.parent, path.resolve().parent)]
         file = next(filter(None, map(in_any_case, likely)), None)
         if file is not None:
-            notes.append(Note("warning", asset.file, f"was not found, and {file.resolve()} is taken for it"))
-            asset.file = str(file.resolve())
+            notes.append(Note("warning", mesh.file, f"was not found, and {file.resolve()} is taken for it"))
+            mesh.file = str(file.resolve())
 
 
 def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) -> mujoco.MjSpec:
@@ -215,15 +229,15 @@ def _spec_of(trees: Mapping[Path, ET.Element], path: Path, notes: list[Note]) ->
 
 
 def _spec_in_memory(trees: Mapping[Path, ET.Element], path: Path) -> mujoco.MjSpec:
-    """The specification of a file and those that it includes as they are in memory; assets are pointed to their files."""
+    """The specification of a file and those that it includes as they are in memory; meshes are pointed to their files."""
     text, *more = (ET.tostring(tree) for tree in trees.values())
     names = [os.path.relpath(file, path.parent) for file in trees if file != path]
     spec = mujoco.MjSpec.from_string(text.decode(), include=dict(zip(names, more, strict=True)))
     spec.modelfiledir = str(path.parent)
-    for asset, folder in (*((mesh, spec.meshdir) for mesh in spec.meshes), *((t, spec.texturedir) for t in spec.textures)):
-        beside = path.parent / asset.file  # where the file of an included one lies, in its own folder
-        if asset.file and beside.is_file() and not (path.parent / (folder or "") / asset.file).is_file():
-            asset.file = str(beside)
+    for mesh in spec.meshes:
+        beside = path.parent / mesh.file  # where the file of an included one lies, in its own folder
+        if mesh.file and beside.is_file() and not (path.parent / (spec.meshdir or "") / mesh.file).is_file():
+            mesh.file = str(beside)
     return spec
 
 

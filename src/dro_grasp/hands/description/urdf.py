@@ -14,8 +14,7 @@ from typing import NoReturn
 from urllib.parse import unquote
 
 from dro_grasp.errors import HandError
-from dro_grasp.files import reading
-from dro_grasp.geometry.mesh_files import FETCH, is_pointer, open_mesh
+from dro_grasp.geometry.mesh_files import FETCH, is_pointer
 from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
 from dro_grasp.hands.description.inertials import mend_urdf_inertials
 from dro_grasp.hands.description.xml_files import DEEPEST
@@ -27,7 +26,7 @@ MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one de
 
 
 def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:
-    """Check the link tree, resolve meshes and set MuJoCo's options.
+    """Check the link tree, resolve meshes, leave out colours, which nothing here draws, and set MuJoCo's options.
 
     Returns XML for MuJoCo, and files as `resolve_meshes` does. HandError: a name is used twice, a number is not one, no joint
     moves, links form a cycle or several trees, or no mesh is found.
@@ -41,6 +40,9 @@ def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, 
         _rename_world(root, path, notes)
     _check_mimic(root, notes)
     files, converted = resolve_meshes(root, path, notes)
+    for coloured in root.findall(".//material/.."):
+        for material in coloured.findall("material"):
+            coloured.remove(material)
     extension = root.find("mujoco")
     extension = ET.SubElement(root, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
@@ -268,22 +270,6 @@ def _is_unusual_stl(file: Path) -> bool:
         head = opened.read(1000)
     whole = file.stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little")
     return int.from_bytes(head[80:84], "little") > 200_000 if whole else head.lstrip().startswith(b"solid") and b"facet" in head
-
-
-def as_obj(file: Path, notes: list[Note]) -> bytes:
-    """A mesh in any format trimesh reads, as OBJ text in metres; another unit that the file states is noted."""
-    import trimesh
-
-    # trimesh alone is called here, and its many readers raise whatever they stumble over.
-    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
-        loaded = open_mesh(file)
-        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
-        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
-        if not math.isclose(unit, 1.0):
-            mesh.apply_scale(unit)
-            told = Note("info", file.name, f"states that its unit is {unit:g} m, and is taken so")
-            notes.extend([] if told in notes else [told])
-        return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
 
 
 def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
