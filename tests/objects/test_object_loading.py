@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import json
 import os
+import struct
 import zipfile
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -56,6 +60,44 @@ def test_scene_is_merged_with_its_transforms(tmp_path: Path):
     assert obj.extents[0] == pytest.approx(0.07, abs=1e-6)
     (told,) = obj.notes
     assert told.startswith("2 separate bodies, up to 3 cm apart, count as one rigid object")
+
+
+def gltf(folder: Path, name: str = "data.bin") -> tuple[Path, dict[str, Any]]:
+    """A box as a glTF beside its numbers, which lie in a file of this name; the path, and what it says."""
+    parts = trimesh.Scene(trimesh.creation.box((0.04, 0.05, 0.06))).export(file_type="gltf", merge_buffers=True)
+    content = json.loads(parts.pop("model.gltf"))
+    (data,) = parts.values()
+    (folder / unquote(name)).write_bytes(data)
+    content["buffers"][0]["uri"] = name
+    (folder / "box.gltf").write_text(json.dumps(content))
+    return folder / "box.gltf", content
+
+
+@pytest.mark.parametrize("name", ["data.bin", "my%20data.bin", "100%25.bin"])
+def test_buffers_of_a_gltf_may_have_names_with_percent_signs(tmp_path: Path, name: str) -> None:
+    assert load_file(gltf(tmp_path, name)[0]).volume == pytest.approx(1.2e-4, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["../secret.bin", "%2e%2e/secret.bin", "..%2Fsecret.bin"])
+def test_buffers_of_a_gltf_lie_beside_it(tmp_path: Path, name: str) -> None:
+    (tmp_path / "own").mkdir()
+    path, _ = gltf(tmp_path / "own", name)
+    assert (tmp_path / "secret.bin").is_file()
+    with pytest.raises(ObjectError, match="there is no such file beside it"):
+        load_file(path)
+
+
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
+def test_compressed_meshes_of_a_gltf_are_told(tmp_path: Path, suffix: str, name: str) -> None:
+    path, content = gltf(tmp_path)
+    text = json.dumps(content | {"extensionsUsed": [name], "extensionsRequired": [name]}).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A)
+    path = path.with_suffix(f".{suffix}")
+    path.write_bytes((head if suffix == "glb" else b"") + text)
+    with pytest.raises(ObjectError, match=rf"its meshes are compressed \({name}\); export it without compression"):
+        load_file(path)
 
 
 def test_bodies_that_touch_or_nearly_do_are_one_thing(tmp_path: Path) -> None:

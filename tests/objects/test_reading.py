@@ -269,6 +269,15 @@ def test_other_normals_of_a_ply_cloud_are_estimated_and_it_is_said(tmp_path: Pat
     assert any("were not used" in note for note in obj.notes)
 
 
+def test_cavities_of_a_cloud_without_normals_are_told_to_be_filled() -> None:
+    points, normals = bowl(3000)
+    filled, hollow = load_object(points), load_object(np.hstack([points, normals]))
+    inside = torch.tensor([[0.0, 0.0, -0.036]])
+    assert float(filled.distance_field.distances(inside)[0]) < 0 < float(hollow.distance_field.distances(inside)[0])
+    assert "cavities, as in a bowl, count as filled" in filled.notes[0]
+    assert "cavities" not in "".join(hollow.notes)
+
+
 def test_normals_of_arrays_are_judged_as_those_of_files() -> None:
     points, normals = bowl(3000)
     turned = load_object(np.hstack([points, -normals]))

@@ -137,7 +137,7 @@ def cloud_object(
     has_normals = normals is not None
     normals = normals if normals is not None else estimate_normals(cloud)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
-    estimated = "" if has_normals else "; normals were estimated"
+    estimated = "" if has_normals else "; normals were estimated, and cavities, as in a bowl, count as filled"
     return ObjectModel(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
