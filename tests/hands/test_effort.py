@@ -15,7 +15,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.simulation.payload import servo_torques
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import build_scene
-from tests.helpers.claw import ball, claw_xml
+from tests.helpers.claw import JAWS, ball, claw_xml
 from tests.helpers.claw_urdf import claw, joint, link, written
 
 
@@ -38,6 +38,16 @@ def test_the_check_says_which_efforts_were_not_believed(tmp_path: Path) -> None:
     assert note.subject == "a"
     assert report.facts["effort"]["b"] == 0.8
     assert not any("effort" in n.text for n in check_hand(with_efforts(tmp_path, 'effort="1"', 'effort="1"')).notes)
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    (JAWS, "with which jaws that slide press by 40 N"), (claw_xml(2), "with which fingertips press by 10 N"),
+    (JAWS.replace('name="slide_left" type="slide" axis="1 0 0" range="-0.03 0.02"',
+                  'name="turn" axis="0 1 0" pos="0 0 -0.05" range="-20 20"'),
+     "with which fingertips press by 10 N and jaws that slide press by 40 N")], ids=["slides", "turns", "both"])
+def test_what_is_taken_is_told_by_how_it_presses(tmp_path: Path, text: str, told: str) -> None:
+    (note,) = (n for n in check_hand(written(tmp_path, text, "hand.xml")).notes if "state no effort" in n.text)
+    assert note.text.endswith(told)
 
 
 def test_what_suits_a_hand_lets_its_tips_press_by_the_force_that_is_named(tmp_path: Path) -> None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
+from dro_grasp.apps.report import told_of
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.simulation.contacts import Penetration
 from dro_grasp.simulation.outcome import REMEDIES, Failure, Measurements, count_failures, diagnose, next_steps
 from dro_grasp.simulation.protocols import Protocol
@@ -53,6 +57,17 @@ def test_where_few_hold_the_next_step_is_named() -> None:
     assert diagnose(batch)[-2:] == [f"  next: {step}" for step in next_steps(batch)]
     same = grasps(Failure.SLIPPED, Failure.LOST)
     assert len(next_steps(same)) == 1, "no advice is given twice"
+
+
+@pytest.mark.parametrize(("origin", "advised"), [(["optimiser"] * 2, False), (["network", "optimiser"], True)])
+def test_the_optimiser_is_not_advised_where_it_made_all(origin: list[str], advised: bool) -> None:
+    from tests.helpers.claw import ball
+
+    batch, made = grasps(Failure.SLIPPED, Failure.LOST), SimpleNamespace(shortage=None, candidates=2, dropped={}, origin=origin)
+    batch = batch.replace(extra={**batch.extra, REASON: ["slipped"] * 2, CONTACT_LINKS: [[]] * 2})
+    told = told_of(ball(), cast(Any, made), batch, hand="toy", num=2, seed=0, weights="w", protocol="strict", frame="object")
+    assert "candidates=16" in "".join(told.report["next"])
+    assert ("optimiser" in "".join(told.report["next"]), "optimiser" in "".join(told.lines)) == (advised, advised)
 
 
 @pytest.mark.parametrize("batch", [grasps(None, None, Failure.SLIPPED), grasps(None, None), grasps(None, evaluated=False)])

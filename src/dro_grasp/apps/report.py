@@ -39,15 +39,16 @@ def told_of(
     simulated = bool(grasps.evaluated.any())
     success = int(grasps.success.sum()) if simulated else None
     rate, *interval = success_rate(success or 0, num)
+    optimised = set(made.origin) == {"optimiser"}
     report = {
         "hand": hand, "object": obj.name, "num": len(grasps), "asked": num, "shortage": made.shortage,
         "candidates": made.candidates, "dropped": made.dropped, "origin": dict(Counter(made.origin)), "origins": made.origin,
         "payload": grasps.payload.tolist(), "squeeze_force": grasps.squeeze_force.tolist(), "seed": seed,
         "weights": weights, "protocol": protocol, "success": success, "success_rate": rate if simulated else None,
-        "interval_95": interval if simulated else None, "reasons": count_failures(grasps), "next": next_steps(grasps),
-        "seconds": {}, "output": None, "picture": None, "frame": frame,
+        "interval_95": interval if simulated else None, "reasons": count_failures(grasps),
+        "next": next_steps(grasps, optimised), "seconds": {}, "output": None, "picture": None, "frame": frame,
     }
-    return Told(report, _rows(grasps, made.origin), _lines(report, grasps))
+    return Told(report, _rows(grasps, made.origin), _lines(report, grasps, optimised))
 
 
 def _rows(grasps: GraspBatch, origin: list[str]) -> list[list[Any]]:
@@ -62,7 +63,7 @@ def _rows(grasps: GraspBatch, origin: list[str]) -> list[list[Any]]:
     return rows
 
 
-def _lines(report: dict[str, Any], grasps: GraspBatch) -> list[str]:
+def _lines(report: dict[str, Any], grasps: GraspBatch, optimised: bool) -> list[str]:
     lines = []
     if report["dropped"]:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items())
@@ -70,7 +71,7 @@ def _lines(report: dict[str, Any], grasps: GraspBatch) -> list[str]:
     if report["success"] is not None:
         found = "" if report["num"] == report["asked"] else f", {report['num']} were found"
         lines.append(f"{report['success']} of {report['asked']} grasps succeeded under protocol {report['protocol']}{found}")
-        lines += diagnose(grasps)
+        lines += diagnose(grasps, optimised)
     if told := forces_of_all(grasps):
         lines.append(f"they {told}")
     return lines

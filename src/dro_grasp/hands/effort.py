@@ -67,6 +67,8 @@ def effort_notes(hand: Hand) -> Iterator[Note]:
         missing = torch.from_numpy(rows) & ~found.stated
         if bool(missing.any()):
             names = [name for name, row in zip(hand.tree.joint_names, missing.tolist(), strict=True) if row]
-            taken = found.limit[missing]
+            taken, slides = found.limit[missing], hand.tree.joint_unit[missing] != 1
+            presses = [f"fingertips press by {TIP_FORCE:.0f} N"] * (not bool(slides.all()))
+            presses += [f"jaws that slide press by {GRIP_FORCE:.0f} N"] * bool(slides.any())
             yield Note("info", ", ".join(names), f"{text}; {float(taken.min()):.2g} to {float(taken.max()):.2g} Nm (N where it "
-                       f"slides) are taken, with which fingertips press by {TIP_FORCE:.0f} N")
+                       f"slides) are taken, with which {' and '.join(presses)}")

@@ -199,7 +199,8 @@ class Measurements:
 
 
 FEW = 0.5  # Share of successes below which a user is told what to do next (ours)
-MORE = "propose more candidates for each grasp (candidates=16), or take them from the optimiser (source='optimiser')"
+OR_OPTIMISE = ", or take them from the optimiser (source='optimiser')"  # Part of advice that is of no use where it made them
+MORE = f"propose more candidates for each grasp (candidates=16){OR_OPTIMISE}"
 """What helps against most failures: choosing from more grasps."""
 REMEDIES = {
     Failure.PENETRATION: MORE,
@@ -219,19 +220,23 @@ def count_failures(grasps: GraspBatch) -> dict[str, int]:
     return {kind.value: count for kind, count in _failures(grasps).most_common()}
 
 
-def diagnose(grasps: GraspBatch) -> list[str]:
+def diagnose(grasps: GraspBatch, optimised: bool = False) -> list[str]:
     """Lines for people: the count of each reason, and what to try next if few of the evaluated grasps held."""
     failures = _failures(grasps)
     lines = [f"  {count} failed: {kind.value}" for kind, count in failures.most_common()]
-    return [*lines, *(f"  next: {step}" for step in next_steps(grasps))]
+    return [*lines, *(f"  next: {step}" for step in next_steps(grasps, optimised))]
 
 
-def next_steps(grasps: GraspBatch) -> list[str]:
-    """What to try where fewer than FEW of the evaluated grasps held: the remedies of the two most frequent failures."""
+def next_steps(grasps: GraspBatch, optimised: bool = False) -> list[str]:
+    """What to try where fewer than FEW of the evaluated grasps held: the remedies of the two most frequent failures.
+
+    Not the optimiser, where it is known that all of them are optimised.
+    """
     failures, evaluated = _failures(grasps), int(grasps.evaluated.sum())
     if int(grasps.trial_success.sum()) >= FEW * evaluated:
         return []
-    return list(dict.fromkeys(REMEDIES[kind] for kind, _ in failures.most_common(2)))
+    steps = dict.fromkeys(REMEDIES[kind] for kind, _ in failures.most_common(2))
+    return [step.replace(OR_OPTIMISE, "") if optimised else step for step in steps]
 
 
 def _failures(grasps: GraspBatch) -> Counter[Failure]:

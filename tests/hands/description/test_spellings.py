@@ -186,6 +186,23 @@ def test_a_root_called_world_tells_how_to_have_a_frame_that_robots_have(tmp_path
     torch.testing.assert_close(whole.grasp_centre_wrist, part.grasp_centre_wrist + torch.tensor([0, 0, 0.5]), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("right", "wrong", "told"), [
+    ('size="0.012 0.012 0.06"', 'size="1 1"', "Element 'box' of link 'left'"),
+    ('xyz="0.035 0 0.01"', 'xyz="0 0"', "Element 'origin' of joint 'b'")])
+def test_what_mujoco_refuses_is_told_by_its_link(tmp_path: Path, right: str, wrong: str, told: str) -> None:
+    """A line of the text that it is given is none of the file, which begins with a comment here."""
+    path = written(tmp_path, "<!-- a\nlicence\n-->\n" + claw().replace(right, wrong, 1))
+    with pytest.raises(HandError) as found:
+        load_description(path)
+    assert told in str(found.value)
+    assert "line" not in str(found.value).replace(str(path), "")
+
+
+def test_a_root_called_world_that_carries_the_fingers_names_no_other(tmp_path: Path) -> None:
+    (told,) = load_description(written(tmp_path, claw().replace('"palm"', '"world"'))).notes
+    assert told.text == "is MuJoCo's name for the ground; this link is called 'world_link' here and in exported files"
+
+
 RANGES = ("<mujoco><compiler {compiler}/><worldbody><body name='palm'><geom type='box' size='.04 .04 .01'/>"
           "<body name='left' pos='-.035 0 .01'><joint name='a' axis='0 1 0' {a}/><geom type='box' size='.006 .006 .03' "
           "pos='0 0 .03'/></body><body name='right' pos='.035 0 .01'><joint name='b' axis='0 -1 0' {b}/><geom type='box' "

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -149,7 +150,19 @@ def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     xml, files, converted = prepare_urdf(root, path, notes)
     assets = {name: _as_obj(file, notes) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
-        return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
+        try:
+            return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
+        except ValueError as error:
+            raise ValueError(_owned(str(error), xml)) from error
+
+
+def _owned(message: str, xml: str) -> str:
+    """What MuJoCo says of a line of XML that is in no file, said of the link or joint that it belongs to."""
+    if (line := re.search(r", line (\d+)", message)) is None:
+        return message
+    before = "\n".join(xml.splitlines()[: int(line[1])])
+    owners = re.findall(r'<(link|joint)\b[^>]*\bname="([^"]*)"', before)
+    return message.replace(line[0], f" of {owners[-1][0]} '{owners[-1][1]}'" if owners else "")
 
 
 def _as_obj(file: Path, notes: list[Note]) -> bytes:

@@ -51,17 +51,21 @@ def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, 
         compiler.attrib.pop(stale, None)
     compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
                            boundinertia=str(LEAST_INERTIA), strippath="false")
+    ET.indent(root)  # a line tells of which link or joint it is
     return ET.tostring(root, encoding="unicode"), files, converted
 
 
 def _rename_world(root: ET.Element, path: Path, notes: list[Note]) -> None:
     """Rename, in place, a root link `world`, which is MuJoCo's name for the ground."""
-    below = [joint.find("child").get("link", "") for joint in root.findall("joint/parent[@link='world']/..")]  # type: ignore[union-attr]
+    below = root.findall("joint/parent[@link='world']/..")
     for place, attribute in (("link", "name"), ("joint/parent", "link")):
         for element in root.findall(f"{place}[@{attribute}='world']"):
             element.set(attribute, "world_link")
-    notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in exported "
-                      f"files, and no robot has such a frame: for poses of link '{below[0]}' give {path.name}#{below[0]}"))
+    told = "is MuJoCo's name for the ground; this link is called 'world_link' here and in exported files"
+    if len(below) == 1 and below[0].get("type") == "fixed":  # else the fingers hang on it
+        link = below[0].find("child").get("link")  # type: ignore[union-attr]
+        told += f", and no robot has such a frame: for poses of link '{link}' give {path.name}#{link}"
+    notes.append(Note("info", "world", told))
 
 
 def _check_names(root: ET.Element, path: Path) -> None:
