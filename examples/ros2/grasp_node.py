@@ -88,7 +88,8 @@ def main() -> None:
             for topic, values in messages.items():
                 message = self.kinds[topic]()
                 set_message_fields(message, values)
-                message.header.stamp = now
+                if "points" not in values:  # a trajectory with a time would begin then, and not when it is sent
+                    message.header.stamp = now
                 self.out[topic].publish(message)
 
     rclpy.init()

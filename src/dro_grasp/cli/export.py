@@ -52,19 +52,21 @@ class Export:
         batches = dict(grasps.by_object())
         folder = form.file_per_grasp or len(batches) > 1
         target = folder_for(self.output, form.suffix, len(batches)) if folder else check_output(self.output, form.suffix)
-        if form.file_per_grasp:
+        if folder:
             refuse_mixing(target, form.suffix)
         jobs = {name: self._job(batch, frame) for name, batch in batches.items()}
         if folder:
             make_folder(target)
         written, labels = list[Path](), set[str]()
         for name, job in jobs.items():
-            label = free_name(name.replace("/", "-"), labels)
+            label = free_name(name.replace("/", "-").lstrip(".") or "object", labels)
             labels.add(label)
             place = target / (label if form.file_per_grasp else f"{label}{form.suffix}")
             written += write(form.content(job), place if len(jobs) > 1 else target, form.suffix)
         if self.json:
-            print_json({"format": self.format, "frame": frame.name, "num": len(grasps), "files": [str(p) for p in written]})
+            frames = {frame.stated(batch) for batch in batches.values()}
+            print_json({"format": self.format, "frame": frames.pop() if len(frames) == 1 else sorted(frames),
+                        "num": len(grasps), "files": [str(p) for p in written]})
         else:
             say(f"{len(grasps)} grasps in {len(written)} file{'s' if len(written) > 1 else ''}: {target}")
         return 0

@@ -71,6 +71,21 @@ def test_drivers_get_every_target_and_controllers_the_same_motion(planned: Motio
     assert float(rows[-1]["arm/joint1"]) == pytest.approx(planned.arm.position[-1, 0], abs=1e-6)
 
 
+@pytest.mark.parametrize("rate", [100, 250, 1000])
+def test_fast_loops_get_no_jumps_of_velocity(planned: MotionPlan, rate: float, robot: dro.Robot) -> None:
+    points = list(planned.points(rate))
+    time, arm = np.array([p.time for p in points[:-1]]), np.stack([p.arm for p in points[:-1]])
+    change = np.abs(np.diff(arm, n=2, axis=0)) * rate**2 / robot.acceleration
+    assert len(time) == np.ceil(planned.seconds * rate - 1e-9)
+    assert change.max() < 1.3, "of the limits; straight lines between samples gave nine times as much"
+
+
+@pytest.mark.parametrize("rate", [0, -5, np.nan, np.inf])
+def test_a_rate_that_gives_no_points_is_refused(planned: MotionPlan, rate: float) -> None:
+    with pytest.raises(dro.DroGraspError, match="give how many points a second has"):
+        planned.points(rate)
+
+
 @pytest.fixture
 def pressing(planned: MotionPlan) -> MotionPlan:
     """The plan with forces of its grasp."""

@@ -109,7 +109,8 @@ def test_a_place_in_a_cloud_becomes_messages(
         "arm": "JointTrajectory", "hand": "JointTrajectory", "squeeze": "JointState", "held": "JointState",
         "empty": "JointState", "grasps": "PoseArray"}
     arm, grasps = node.sent["arm"], node.sent["grasps"]
-    assert (arm.joint_names, arm.header.stamp.sec) == (list(planned.notes.arm_joints), 7)
+    assert (arm.joint_names, arm.header.stamp.sec) == (list(planned.notes.arm_joints), 0), "it begins when it is sent"
+    assert node.sent["squeeze"].header.stamp.sec == 7
     np.testing.assert_allclose(arm.points[-1].positions, planned.arm.position[-1], atol=1e-6)
     assert arm.points[-1].time_from_start.sec == int(planned.seconds)
     best = planned.scene.T_world_wrist[planned.scene.score.argmax()]

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,28 @@ def test_sliding_joints_have_lengths(values: dict[str, Any], tmp_path: Path) -> 
         load_robot(written(values | {"zeros": {"left_slide": 20}}, tmp_path))
     with pytest.raises(RobotError, match="units of joint left_slide is 'deg'; expected m, cm, mm, or how many of them a metre"):
         load_robot(written(values | {"units": {"left_slide": "deg"}}, tmp_path))
+
+
+def test_a_hand_is_as_fast_as_its_description_says_and_slides_are_slow(values: dict[str, Any], tmp_path: Path) -> None:
+    jaws = (sliding(name, f"0 {-side} 0", 0.0, 0.035, at=f"0 {side * 0.04} 0.06")
+            for name, side in (("left", 1), ("right", -1)))
+    text = whole(block("palm", "0.06 0.12 0.06"), *jaws)
+    (tmp_path / "jaws.urdf").write_text(text)
+    values |= {"hand": str(tmp_path / "jaws.urdf")}
+    values.pop("hand_limits", None)
+    robot = load_robot(written(values, tmp_path))
+    assert (robot.hand_velocity <= 0.06 + 1e-9).all()
+    assert robot.hand_acceleration.tolist() == pytest.approx([0.3, 0.3])
+    slow = re.sub(r'velocity="[^"]*"', 'velocity="0.02"', text)
+    assert slow != text
+    (tmp_path / "jaws.urdf").write_text(slow)
+    assert load_robot(written(values, tmp_path)).hand_velocity.tolist() == pytest.approx([0.02, 0.02])
+    stated = {"hand_limits": {"velocity": {"left_slide": 0.1}, "acceleration": 0.5}}
+    robot = load_robot(written(values | stated, tmp_path))
+    assert dict(zip(robot.hand_joints, robot.hand_velocity, strict=True)) == {"left_slide": 0.1, "right_slide": 0.02}
+    assert robot.hand_acceleration.tolist() == [0.5, 0.5]
+    with pytest.raises(RobotError, match="hand_limits: velocity names joint 'thumb'"):
+        load_robot(written(values | {"hand_limits": {"velocity": {"thumb": 1.0}}}, tmp_path))
 
 
 def test_usual_drivers_count_as_the_description_does() -> None:

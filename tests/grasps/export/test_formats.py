@@ -78,6 +78,39 @@ def postures(grasps: GraspBatch) -> dict[str, torch.Tensor]:
     return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
 
 
+def test_objects_with_names_of_folders_stay_in_the_folder(grasps: GraspBatch, tmp_path: Path) -> None:
+    strange = grasps[[0, 1, 2, 4]].replace(object=("..", "..", "a/b", "a/b"), object_sha256=("", "", "", ""))
+    strange.save(tmp_path / "strange.parquet")
+    assert export(tmp_path / "strange.parquet", "--format", "csv", "--output", tmp_path / "inner" / "out") == 0
+    assert sorted(p.name for p in (tmp_path / "inner").iterdir()) == ["out"]
+    assert sorted(p.name for p in (tmp_path / "inner" / "out").iterdir()) == ["a-b.csv", "object.csv"]
+
+
+def test_old_files_are_not_mixed_with_new_ones(grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grasps.save(tmp_path / "all.parquet")
+    assert export(tmp_path / "all.parquet", "--format", "csv", "--output", tmp_path / "out") == 0
+    assert export(tmp_path / "all.parquet", "--format", "csv", "--output", tmp_path / "out") == 2
+    assert "old and new grasps would be mixed" in capsys.readouterr().err
+
+
+def test_json_names_the_frame_of_what_a_camera_saw(
+    grasps: GraspBatch, camera: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = grasps[[0, 1]].replace(extra={FRAME: ("base", "base"), CAMERA: torch.eye(4).reshape(1, 16).repeat(2, 1)})
+    seen.save(tmp_path / "seen.parquet")
+    for frame, told in (([], "base"), (["--frame", camera], "camera")):
+        assert export(tmp_path / "seen.parquet", "--format", "csv", "--output", tmp_path / "a.csv", "--json", *frame) == 0
+        assert json.loads(capsys.readouterr().out)["frame"] == told
+
+
+def test_no_other_frame_is_called_as_the_object_s_own(one: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    (tmp_path / "frame.json").write_text(json.dumps({"frame": "object", "T_frame_object": T.tolist()}))
+    assert export(one, "--format", "csv", "--output", tmp_path / "a.csv", "--frame", tmp_path / "frame.json") == 2
+    assert "calls its frame 'object'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("in_camera", [False, True])
 def test_isaac_grasp(grasps: GraspBatch, one: Path, camera: Path, tmp_path: Path, in_camera: bool) -> None:
     out = tmp_path / "out.yaml"
@@ -88,7 +121,9 @@ def test_isaac_grasp(grasps: GraspBatch, one: Path, camera: Path, tmp_path: Path
     assert content["gripper_frame_link"] == loaded_hand(HAND).wrist_link
     assert list(content["grasps"]) == ["grasp_0", "grasp_1", "grasp_2"]
     for i, grasp in zip((0, 1, 3), content["grasps"].values(), strict=True):
-        assert set(grasp) == {"confidence", "position", "orientation", "cspace_position", "pregrasp_cspace_position"}
+        assert set(grasp) == {"confidence", "position", "orientation", "cspace_position", "pregrasp_cspace_position",
+                              "squeeze_cspace_position"}
+        np.testing.assert_allclose(list(grasp["squeeze_cspace_position"].values()), grasps.squeeze_joints[i], atol=1e-6)
         wxyz = [grasp["orientation"]["w"], *grasp["orientation"]["xyz"]]
         np.testing.assert_allclose(pose(grasp["position"], wxyz), expected(grasps, i, in_camera), atol=2e-6)
         assert list(grasp["cspace_position"]) == list(grasps.joint_names)

@@ -298,9 +298,7 @@ def _reversed(way: Trajectory) -> Trajectory:
 def _open(rig: Rig, robot: Robot) -> None:
     """Open the hand where the arm is."""
     arm, hand = rig.joints()
-    n = len(hand)
-    way = smooth(np.stack([hand, robot.open_hand]), np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration),
-                 OPENING_SECONDS)
+    way = smooth(np.stack([hand, robot.open_hand]), robot.hand_velocity, robot.hand_acceleration, OPENING_SECONDS)
     rig.move(still(arm, way), way)
 
 

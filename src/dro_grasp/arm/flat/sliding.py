@@ -314,8 +314,7 @@ class _Pusher:
         back = None if there is None else free_motion(robot, up[-1], home, pushed, config.path_seconds, self.seed, LEAVING)
         if there is None or back is None:
             return None
-        n = len(opened)
-        fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+        fingers = robot.hand_velocity, robot.hand_acceleration
         shape = smooth(np.stack([opened, self.pointing]), *fingers, STEP)
         unshape = smooth(np.stack([self.pointing, opened]), *fingers, STEP)
         if not all(cell.free(down[0], posture, 0.0) for posture in shape.position) or not all(

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline
 
 from dro_grasp.arm.planning.placing import foot
 from dro_grasp.arm.robots.drivers import Drivers
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.errors import PlanError
+from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
 from dro_grasp.grasps.export.writers import yaml_text
@@ -227,15 +228,28 @@ class MotionPlan:
         return share[:, None] * np.array(self.notes.squeeze_torque)
 
     def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
-        """Targets at a rate [1/s], the last one included, as drivers count joints: for a loop that sends them to a robot."""
+        """Targets at a rate [1/s], the last one included, as drivers count joints: for a loop that sends them to a robot.
+
+        Between samples, joints follow cubic curves with the velocities of these, so that fast loops send no jumps of velocity.
+
+        Raises:
+            OptionError: The rate is not finite and above 0.
+        """
+        if not 0 < rate < math.inf:
+            raise OptionError(f"rate is {rate}; give how many points a second has, such as 100")
+        return self._points(rate)
+
+    def _points(self, rate: float) -> Iterator[MotionPoint]:
         effort, (of_arm, of_hand) = self.hand_effort, self.drivers
-        columns = [of_arm.positions(self.arm.position), of_hand.positions(self.hand.position)]
-        columns += [] if effort is None else [of_hand.efforts(effort)]
         count = int(np.ceil(self.seconds * rate - 1e-9))
-        for time in [*(i / rate for i in range(count)), self.seconds]:
-            row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
-            yield MotionPoint(float(time), self.stages[int(self.stage[row])], *(
-                np.array([np.interp(time, self.arm.time, column) for column in table.T]) for table in columns))
+        times = np.array([*(i / rate for i in range(count)), self.seconds])
+        arm, hand = (CubicHermiteSpline(part.time, part.position, part.velocity)(times) for part in (self.arm, self.hand))
+        columns = [of_arm.positions(arm), of_hand.positions(hand)]
+        if effort is not None:
+            columns.append(of_hand.efforts(np.stack([np.interp(times, self.hand.time, c) for c in effort.T], 1)))
+        rows = np.searchsorted(self.arm.time, times, side="left").clip(max=len(self.stage) - 1)
+        for i, row in enumerate(rows):
+            yield MotionPoint(float(times[i]), self.stages[int(self.stage[row])], *(column[i] for column in columns))
 
     def lines(self) -> list[str]:
         """The plan for people: what was dropped, what is done, how long it takes."""

@@ -151,9 +151,9 @@ def _lifting(
     grip_seconds: float,
 ) -> list[Pair] | None:
     """The STAGES; arguments as for `timed_stages`."""
-    robot, n = cell.robot, len(hand.grasp)
+    robot = cell.robot
     limits = robot.velocity, robot.acceleration
-    fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+    fingers = robot.hand_velocity, robot.hand_acceleration
 
     def clear(reach: Trajectory) -> bool:
         return all(cell.free(q, hand.opened, CLEARANCE - NEARER) for q in reach.position)
@@ -185,10 +185,10 @@ def _placing(
 
     The object is set down slowly, and the hand opens slowly: what is let go in a jerk tips over.
     """
-    robot, n = cell.robot, len(hand.grasp)
+    robot = cell.robot
     limits = robot.velocity, robot.acceleration
     gentle = CARRY_SPEED * robot.velocity, CARRY_ACCELERATION * robot.acceleration
-    fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+    fingers = robot.hand_velocity, robot.hand_acceleration
 
     def clear(way: Trajectory, kept: float) -> bool:
         return all(

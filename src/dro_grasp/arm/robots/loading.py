@@ -27,6 +27,8 @@ from dro_grasp.hands.library import load_hand, locate_hand
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
 FARTHEST_ZERO = 10.0  # Largest stated zero of a driver of a joint that slides [m] (ours); of one that turns it is a turn
+HAND_LIMITS = {"velocity": 2.0, "acceleration": 10.0}
+"""Usual limits of a hand's joints [rad/s, rad/s^2], for slides times SLIDING_UNIT (ours)."""
 HOME_KEY = "home"  # Name that MJCF files give the key in which a robot waits, as those of MuJoCo Menagerie do
 
 
@@ -72,9 +74,24 @@ def load_robot(name: str | Path) -> Robot:
         velocity, acceleration, effort = (
             faults.of(lambda kind=kind, usual=usual: fit.limit(kind, usual), none)
             for kind, usual in (("velocity", None), ("acceleration", None), ("effort", 50.0)))
+        fast, quick = (faults.of(lambda kind=kind: _hand_limit(file, hand.path, loaded, kind), np.zeros(loaded.tree.n_dof))
+                       for kind in HAND_LIMITS)
     return Robot(
         file.name, arm, loaded, fit.mount, file.T_link_wrist, file.T_world_base, home, lower, upper, velocity, acceleration,
-        effort, file.hand_velocity, file.hand_acceleration, file.camera, file.table, drivers)
+        effort, fast, quick, file.camera, file.table, drivers)
+
+
+def _hand_limit(file: RobotFile, path: Path, hand: Hand, kind: str) -> Float[np.ndarray, " n_dof"]:
+    """A limit of the hand's joints: one for all, or by joint; else what its URDF states, up to what is usual."""
+    given, names = file.hand_limits.get(kind, {}), hand.tree.joint_names
+    if not isinstance(given, dict):
+        return np.full(len(names), file.positive(given, f"hand_limits: {kind}"))
+    if unknown := [str(name) for name in given if name not in names]:
+        raise file.error(f"hand_limits: {kind} names joint '{unknown[0]}'; the joints of the hand are {', '.join(names)}")
+    usual = HAND_LIMITS[kind] * hand.tree.joint_unit.double().numpy()
+    stated = _stated_limits(path, kind)
+    return np.array([file.positive(given[name], f"hand_limits: {kind} of joint {name}") if name in given
+                     else min(most, stated.get(name, most)) for name, most in zip(names, usual.tolist(), strict=True)])
 
 
 def _load_arm(file: RobotFile, within: str | None) -> Description:

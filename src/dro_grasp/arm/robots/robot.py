@@ -84,9 +84,9 @@ class Robot:
     """Largest acceleration [rad/s^2 or m/s^2]."""
     effort: Float[np.ndarray, " n_arm"]
     """Largest torque or force [Nm or N]."""
-    hand_velocity: float
+    hand_velocity: Float[np.ndarray, " n_dof"]
     """Largest speed of the hand's joints [rad/s or m/s]."""
-    hand_acceleration: float
+    hand_acceleration: Float[np.ndarray, " n_dof"]
     """Largest acceleration of the hand's joints [rad/s^2 or m/s^2]."""
     camera: CameraMount | None
     """A depth camera that stands still; None without one."""

@@ -76,11 +76,8 @@ class RobotFile:
         self.home = faults.of(lambda: self._home(values.get("home")), None)
         self.limits = faults.of(lambda: self.mapping(
             values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"}), {})
-        hand_limits = faults.of(lambda: self.mapping(
+        self.hand_limits = faults.of(lambda: self.mapping(
             values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"}), {})
-        self.hand_velocity, self.hand_acceleration = (
-            faults.of(lambda kind=kind, usual=usual: self.positive(hand_limits.get(kind, usual), f"hand_limits: {kind}"), usual)
-            for kind, usual in (("velocity", 2.0), ("acceleration", 10.0)))
         self.camera = faults.of(lambda: self._camera(values.get("camera")), None)
         self.table = faults.of(lambda: self._table(values.get("table")), None)
         self.drivers = {key: faults.of(lambda key=key: self.mapping(values.get(key, {}), key), {}) for key in DRIVER_KEYS}

@@ -51,15 +51,23 @@ class Frame:
         """Read `{"frame": NAME, "T_frame_object": 4x4}`.
 
         Raises:
-            OptionError: No such file, no such content, or no rigid motion.
+            OptionError: No such file, no such content, or no rigid motion; or another frame has the name of the object's own.
         """
-        return Frame(*read_motion(path, "T_frame_object"))
+        frame = Frame(*read_motion(path, "T_frame_object"))
+        if frame.name == OBJECT and not torch.equal(frame.T_frame_object, torch.eye(4).to(frame.T_frame_object)):
+            raise OptionError(f"{path} calls its frame '{OBJECT}', as the object's own is called; give it another name, such "
+                              "as 'world'")
+        return frame
 
     def place(self, grasps: GraspBatch) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
         """Positions [m] and unit quaternions (WXYZ, w not negative) of the wrists in this frame."""
         T = self.T_frame_object.to(grasps.T_object_wrist) @ grasps.T_object_wrist
         quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(roma.special_procrustes(T[:, :3, :3].double())))
         return T[:, :3, 3].double(), torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+
+    def stated(self, grasps: GraspBatch) -> str:
+        """This frame's name, or that which grasps give the frame of their object; 'object' where that has none."""
+        return (frame_of(grasps) if self.name == OBJECT else None) or self.name
 
     def name_for(self, grasps: GraspBatch) -> str:
         """This frame's name; the object's own frame has the name that its grasps give it, or else the object's.
@@ -170,10 +178,10 @@ def isaac_grasp(grasps: GraspBatch, frame: Frame, hand: Hand | None = None) -> s
             "confidence": NO_CONFIDENCE if stated is None else stated, "position": plain(position[i]),
             "orientation": {"w": w, "xyz": xyz}, "cspace_position": dict(zip(names, plain(grasps.joints[i]), strict=True)),
             "pregrasp_cspace_position": dict(zip(names, plain(joints["pregrasp"][i]), strict=True)),
+            "squeeze_cspace_position": dict(zip(names, plain(joints["squeeze"][i]), strict=True)),
         }
         if (effort := efforts_of(efforts, i)) is not None:
-            entries[f"grasp_{i}"] |= {"squeeze_cspace_position": dict(zip(names, plain(joints["squeeze"][i]), strict=True)),
-                                      "squeeze_cspace_effort": dict(zip(names, plain(effort), strict=True))}
+            entries[f"grasp_{i}"]["squeeze_cspace_effort"] = dict(zip(names, plain(effort), strict=True))
         entries[f"grasp_{i}"] |= {name: dict(zip(names, plain(row), strict=True)) for name, row in hold(grasps, i).items()}
         entries[f"grasp_{i}"] |= forces(grasps, i)
     content = {"format": "isaac_grasp", "format_version": 1.0, "object_frame_link": frame.name_for(grasps),
