@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
@@ -184,6 +185,18 @@ def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytes
     file = tmp_path / "assets/hands/ezgripper/ezgripper.urdf"
     file.touch()
     assert (cache_folder(), locate_hand("assets/ezgripper").path) == (tmp_path / "cache", file)
+
+
+def test_a_user_without_a_home_has_no_cache_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container with a user number of its own."""
+    from dro_grasp.geometry.cache import cached_arrays
+
+    for name in ("DRO_GRASP_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.getuid", lambda: 987654321)
+    with pytest.raises(RuntimeError):
+        Path.home()
+    assert cached_arrays("key", lambda: {"a": np.arange(3)})["a"].tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("stated", ["", "cache", None])

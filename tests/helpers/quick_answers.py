@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,7 +35,10 @@ class QuickAnswerer:
         return ["can"]
 
     def answer(self, call: Any, progress: Callable[[int, int], None]) -> Any:
-        """`echo`, `die`, be `killed`, `nap` for half a second, `sleep` until it is cancelled, or `hang` whatever is said."""
+        """`echo`, `die`, be `killed`, `nap` for half a second, `sleep` until it is cancelled, or `hang` whatever is said.
+
+        `file` hangs after it has made a temporary file.
+        """
         if call.hand == "die":
             os._exit(7)
         if call.hand == "killed":
@@ -42,7 +47,9 @@ class QuickAnswerer:
             raise OptionError("num is 0")
         if call.hand == "faulty":
             raise ZeroDivisionError
-        if call.hand == "hang":
+        if call.hand == "file":
+            (Path(tempfile.mkdtemp()) / "mesh.stl").touch()
+        if call.hand in {"file", "hang"}:
             time.sleep(60)
         if call.hand == "nap":
             time.sleep(0.5)

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, OutputError
 from dro_grasp.objects import convex_parts
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.convex_parts import COARSE_VERTICES, MAX_BODIES, Part, coarse_parts
@@ -190,6 +190,14 @@ def test_what_one_library_cannot_cut_the_other_does(monkeypatch: pytest.MonkeyPa
     ring = mesh_object("ring", trimesh.creation.torus(0.03, 0.012), origin="ring")
     assert inside_share(ring, ring.parts) > 0.97
     assert "because CoACD failed (assertion failed)" in ring.notes[-1]
+
+
+def test_a_full_disk_for_temporary_files_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("numpy.savez", lambda *_, **__: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OutputError, match=r"No space left on device.*TMPDIR"):
+        cut_apart("coacd", trimesh.creation.box(), 5.0, lambda _: None)
+    assert not list(tmp_path.iterdir())
 
 
 def test_reasons_come_from_the_process():

@@ -27,6 +27,7 @@ from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.training import loop, losses, pretraining, runs
 from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.data.engine.shards import sole_run
 from dro_grasp.training.runs import (
     CHECKPOINT,
     LOG,
@@ -258,6 +259,13 @@ def test_an_impossible_schedule_is_refused(bundle: Bundle, tmp_path: Path, name:
     with pytest.raises(OptionError, match=f"{name} is {value}"):
         run_stage("train", bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, **{name: value}))
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_folder_in_which_another_run_trains_is_refused(bundle: Bundle, tmp_path: Path, stage: str) -> None:
+    with sole_run(tmp_path), pytest.raises(OutputError, match=r"another run is filling .* give another folder$"):
+        run_stage(stage, bundle, tmp_path)
+    assert not (tmp_path / LOG).exists()
 
 
 def test_a_folder_that_cannot_be_made_is_refused_before_the_work(

@@ -11,7 +11,7 @@ from dro_grasp.grasps.batch import percent
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.grasps.forces import forces_of_all, known, short
 from dro_grasp.simulation.outcome import count_failures, diagnose, next_steps
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
@@ -83,7 +83,9 @@ def protocol_for(obj: ObjectModel, given: str | None) -> str:
 
 
 def require_trial(obj: ObjectModel, given: str | None, only_successful: bool) -> None:
-    """Refuse a trial of a bare cloud, and to keep the successful grasps of what gets none: OptionError."""
+    """Refuse unknown protocols, a trial of a bare cloud, and to keep the successful grasps of what gets none: OptionError."""
+    if given is not None and given != NO_TRIAL:
+        protocol(given)
     if obj.is_cloud and given not in {None, NO_TRIAL}:
         raise OptionError(f"protocol='{given}' asks for a trial, and '{obj.name}' is a bare point cloud; a trial needs a mesh "
                           "(object=...), or leave out protocol=...")

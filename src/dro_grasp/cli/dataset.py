@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -257,25 +258,30 @@ class Merge(DataSets):
     def run(self) -> int:
         """Merge, and write the files."""
         from dro_grasp.training.data.collections.merging import (
+            ASIDE,
             file_name,
             merge,
             remove_further,
             require_choice,
             require_no_shards,
         )
+        from dro_grasp.training.data.engine.shards import sole_run
 
         require_choice(self.per_pair)
         given = self.given(self.output)
         require_no_shards(self.output)
         folder = make_folder(self.output)
         rows, last = [], {}
-        for merged in merge(given, self.per_pair, folder):
-            path = folder / file_name(merged.hand, merged.number)
-            merged.save(path)
-            last[merged.hand] = merged.number
-            rows.append([merged.hand, len(merged), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
-        for hand, number in last.items():
-            remove_further(folder, hand, number)
+        with sole_run(folder):
+            for left in folder.glob(f"{ASIDE}*"):  # by a run that was killed
+                rmtree(left, ignore_errors=True)
+            for merged in merge(given, self.per_pair, folder):
+                path = folder / file_name(merged.hand, merged.number)
+                merged.save(path)
+                last[merged.hand] = merged.number
+                rows.append([merged.hand, len(merged), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
+            for hand, number in last.items():
+                remove_further(folder, hand, number)
         columns = ["hand", "grasps", "duplicates", "surplus", "bytes", "file"]
         values, total = {"output": str(folder), "files": records(columns, rows)}, sum(row[1] for row in rows)
         print_result(self.json, values, f"merged into {folder}", columns, rows, f"{total} grasps in all")

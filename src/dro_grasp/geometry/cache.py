@@ -41,14 +41,14 @@ def stored_arrays(key: str) -> Arrays | None:
     try:
         with (cache_folder() / f"{key}.npz").open("rb") as file, np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
-    except FOREIGN:  # missing, truncated, or no archive of arrays
+    except (*FOREIGN, RuntimeError):  # missing, truncated, no archive of arrays, or of a user without a home
         return None
 
 
 def store_arrays(key: str, arrays: Arrays) -> None:
-    """Put arrays into the cache. A folder that cannot be written is no error; it only costs time."""
-    path = cache_folder() / f"{key}.npz"
-    with contextlib.suppress(OSError, OutputError):
+    """Put arrays into the cache. A folder that is unknown or cannot be written is no error; it only costs time."""
+    with contextlib.suppress(OSError, OutputError, RuntimeError):
+        path = cache_folder() / f"{key}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]

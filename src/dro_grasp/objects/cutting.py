@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jaxtyping import Float, Int
 
+from dro_grasp.errors import OutputError
 from dro_grasp.files import MAX_QUOTED_CHARS
 from dro_grasp.geometry.mesh_files import trimesh
 
@@ -34,11 +35,19 @@ class CutShortError(Exception):
 def cut_apart(
     method: str, mesh: trimesh.Trimesh, seconds: float, spent: Spent, **options: float | int | bool | str
 ) -> list[Part]:
-    """Convex parts of a closed mesh by `coacd` or `vhacd`, within some seconds of computing; CutShortError without any."""
-    with TemporaryDirectory(prefix="dro-grasp-") as folder:
-        source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
-        given = {"vertices": mesh.vertices, "faces": mesh.faces, **options}
-        np.savez(source, **{name: np.asarray(value) for name, value in given.items()})  # type: ignore[arg-type]
+    """Convex parts of a closed mesh by `coacd` or `vhacd`, within some seconds of computing; CutShortError without any.
+
+    OutputError: there is no room for temporary files.
+    """
+    given = {"vertices": mesh.vertices, "faces": mesh.faces, **options}
+    with contextlib.ExitStack() as stack:
+        try:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="dro-grasp-")))
+            source, target = folder / "mesh.npz", folder / "parts.npz"
+            np.savez(source, **{name: np.asarray(value) for name, value in given.items()})  # type: ignore[arg-type]
+        except OSError as error:
+            raise OutputError(f"a mesh cannot be cut into convex parts: its temporary file cannot be written "
+                              f"({error.strerror or error}); free some space, or name another folder in TMPDIR") from error
         _run([method, str(source), str(target), str(seconds)], spent)
         with np.load(target) as stored:
             found = [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(stored.files) // 2)]

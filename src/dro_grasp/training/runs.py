@@ -33,6 +33,7 @@ from dro_grasp.kinds import flat
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.data.bundle.training_file import Bundle
+from dro_grasp.training.data.engine.shards import sole_run
 
 SECONDS_BETWEEN_LINES = 10.0  # Least time between two lines on the console [s]. Source: ours
 
@@ -354,11 +355,17 @@ class TrainingRun:
 
         Raises:
             TrainingError: A loss or the gradient is not finite, or the folder holds the checkpoint of another run.
-            OutputError: The folder cannot be made, or log or checkpoint cannot be written.
+            OutputError: The folder cannot be made, another run is filling it, or log or checkpoint cannot be written.
         """
+        if self.processes.first:
+            with sole_run(make_folder(self.folder.path)):
+                self._train(losses, report, draw)
+        else:
+            self._train(losses, report, draw)
+
+    def _train(self, losses: Callable[..., Losses], report: Report, draw: Callable[[torch.Generator], Any] | None) -> None:
         reports = []
         if self.processes.first:
-            make_folder(self.folder.path)
             reports.append(report)
             if self.schedule.tensorboard:
                 reports.append(tensorboard_report(self.folder.path))

@@ -25,7 +25,8 @@ pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[a
 
 from dro_grasp.apps.server.answering import Answerer, ServerConfig, sent_grasps
 from dro_grasp.apps.server.client import sent_file, sent_mask
-from dro_grasp.apps.server.messages import GraspAnswer, GraspCall
+from dro_grasp.apps.server.messages import GenerateCall, GraspAnswer, GraspCall
+from dro_grasp.apps.server.request_queue import Cancelled
 
 QUICK: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
 TUBE = trimesh.creation.cylinder(0.03, 0.1)
@@ -186,6 +187,33 @@ CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
 def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
     with pytest.raises(dro.DroGraspError, match=told):
         answerer.answer(GraspCall(**{"hand": "gripper3", "object": "can", **QUICK, **asked}))
+
+
+@pytest.mark.parametrize("kind", [GraspCall, GenerateCall])
+def test_an_unknown_protocol_is_refused_before_the_work(
+    answerer: Answerer, kind: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(answerer.predictor, "run", lambda *_: pytest.fail("grasps are made"))
+    with pytest.raises(dro.DroGraspError, match="no protocol is called 'drop'"):
+        answerer.answer(kind(hand="gripper3", object="can", protocol="drop"))
+
+
+@pytest.mark.parametrize("kind", [GraspCall, GenerateCall])
+def test_a_request_can_be_cancelled_while_its_object_is_cut(
+    answerer: Answerer, kind: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cancelled(done: int, total: int) -> None:
+        if total == 7777:
+            raise Cancelled
+
+    def cut(vertices: Any, faces: Any, sha256: str, progress: Any = None) -> Any:
+        assert progress is not None, "it would be cut unheard"
+        progress(0, 7777)
+
+    monkeypatch.setattr("dro_grasp.objects.shape.decompose", cut)
+    stl = trimesh.creation.torus(0.031, 0.012).export(file_type="stl")
+    with pytest.raises(Cancelled):
+        answerer.answer(kind(hand="gripper3", object=sent_file("ring.stl", stl)), cancelled)
 
 
 def test_one_thing_of_a_scene_is_chosen_and_all_else_is_avoided(answerer: Answerer, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -232,6 +233,38 @@ def test_a_process_that_is_terminated_with_its_server_says_so() -> None:
     time.sleep(0.3)  # it is known by then how the process ended, and not yet that the server stops
     queue.close(patience=20.0)
     assert running.reply.result(0).status == 503
+
+
+def test_a_system_that_starts_no_process_is_told_and_the_next_request_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    queue = RequestQueue(None, answerer=QuickAnswerer)
+    os.kill(queue.ready.process, signal.SIGKILL)
+    while queue._pool.active:
+        time.sleep(0.01)
+    monkeypatch.setattr("dro_grasp.apps.server.request_queue.ProcessPool", refused)
+    for name in "ab":
+        reply = queue.submit(call(name)).reply.result(10)
+        assert reply.status == 500
+        assert b"Too many open files" in reply.body
+    monkeypatch.undo()
+    assert queue.submit(call("c")).reply.result(20)[:2] == (200, b"c")
+    queue.close()
+
+
+def test_a_process_that_is_ended_leaves_no_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    queue = RequestQueue(None, answerer=QuickAnswerer, grace=0.1)
+    files = submitted(queue, "files", "file")
+    while not list(tmp_path.rglob("mesh.stl")):
+        time.sleep(0.01)
+    queue.cancel("files")
+    assert files.reply.result(5).status == 409
+    wait_for_idle(queue)
+    queue.close()
+    assert not list(tmp_path.rglob("mesh.stl"))
 
 
 def test_refused_requests_are_taken_in_turn_when_they_come_again() -> None:

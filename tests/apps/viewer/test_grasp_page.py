@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import socket
 import threading
 import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +119,17 @@ def test_a_grasp_that_takes_long_is_not_drawn_over_a_later_one(viewer: GraspView
 def test_only_this_machine_is_served(viewer: GraspViewer) -> None:
     assert viewer.server.get_host() == HOST == "127.0.0.1"
     assert viewer.url.startswith("http://127.0.0.1:")
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="needs IPv6")
+def test_addresses_of_the_newer_kind_are_served() -> None:
+    served = ServedPage(free_port(), "::1")
+    try:
+        assert served.url == f"http://[::1]:{served.server.get_port()}"
+        with urllib.request.urlopen(served.url, timeout=20) as answer:
+            assert answer.status == 200
+    finally:
+        served.stop()
 
 
 @pytest.mark.parametrize(("port", "host", "cause"), [

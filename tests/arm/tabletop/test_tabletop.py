@@ -19,7 +19,7 @@ from dro_grasp.arm.tabletop.attempts import Attempt, endings, failures, read_att
 from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.arm.tabletop.run import TabletopRun, run_tabletop
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.network.checkpoints import DEFAULT, load_weights, save_weights
 from tests.helpers.processes import alive, children, start, wait_for
 
@@ -193,6 +193,19 @@ def test_a_run_that_is_stopped_begins_nothing_more_and_keeps_what_has_ended(
         parent.kill()
     wait_for(lambda: not any(alive(pid) for pid in started))
     assert sorted((a.object, a.number) for a in read_attempts(output)) == [("can", 0), ("torus", 0)]
+
+
+def test_a_second_run_into_one_file_is_refused_and_loses_nothing(small_robot: str, tmp_path: Path) -> None:
+    output, run = tmp_path / "stored.parquet", TabletopRun(small_robot, ("can",), attempts=2)
+
+    def ended(robot: dro.Robot, obj: dro.ObjectModel, number: int, *others: object) -> Attempt:
+        if number:
+            with pytest.raises(OutputError, match=r"another run is storing its attempts in .*stored.parquet"):
+                run_tabletop(replace(run, objects=("torus",)), output, make=deadly)
+        return deadly(robot, obj, number, *others)
+
+    run_tabletop(run, output, make=ended)
+    assert len(run_tabletop(run, output)) == 2
 
 
 def test_a_bare_cloud_is_refused_before_anything_is_attempted(small_robot: str, tmp_path: Path) -> None:

@@ -217,6 +217,21 @@ def test_a_rerun_filters_what_is_missing_damaged_or_changed_alone(stored, tmp_pa
     assert done[3:] == ["sphere"]
 
 
+def test_a_rerun_with_more_that_is_stopped_is_not_taken_for_whole(stored, tmp_path, monkeypatch):
+    def stopped(*_: object):
+        raise KeyboardInterrupt
+
+    config, (first, second) = FilterConfig((changed("dro"),)), list(read_collection(stored, only_successful=False))
+    filter_dataset([first], tmp_path, config)
+    original = filtering.filter_pair
+    second_too, twice = replace(second, object="another"), [original, stopped]
+    monkeypatch.setattr(filtering, "filter_pair", lambda *given: twice.pop(0)(*given))
+    with pytest.raises(KeyboardInterrupt):
+        filter_dataset([first, second, second_too], tmp_path, config)
+    read = {pair.object for pair in read_collection(tmp_path, only_successful=False)}
+    assert read == {shard.object for shard in find_shards(tmp_path)} > {first.object}
+
+
 def test_several_processes_make_the_same_files(stored, tmp_path):
     pairs, config = list(read_collection(stored, only_successful=False)), FilterConfig((changed("dro"),))
     reports = [filter_dataset(pairs, tmp_path / str(n), config, workers=n) for n in (1, 2)]

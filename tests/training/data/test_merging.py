@@ -76,7 +76,9 @@ def test_what_two_sets_share_is_kept_once_and_failures_are_left_out(folders, han
 
 def test_merged_files_are_collections_with_their_yields(folders, tmp_path, capsys):
     out = tmp_path / "merged"
+    (left := out / ".merge-killed").mkdir(parents=True)  # by a run that was killed
     assert main(["dataset", "merge", *map(str, folders), "--output", str(out), "--per-pair", "5", "--json"]) == 0
+    assert not left.exists()
     (told,) = json.loads(capsys.readouterr().out)["files"]
     assert (told["hand"], told["grasps"], told["duplicates"], told["surplus"]) == ("gripper3", 10, 10, 14)
     pairs = {p.object: p for p in read_collection(out)}

@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.training.data.collections.collection import count_collection, read_collection
+from dro_grasp.training.data.engine.schedule import require_known
 from dro_grasp.training.data.engine.shards import Shard, Yield, find_shards, notes_of, read_yield, remove_leftovers
 
 
@@ -35,6 +36,14 @@ def test_any_name_makes_a_shard_inside_the_folder(tmp_path, hand, obj):
     assert find_shards(tmp_path) == [shard]
     assert shard.path(tmp_path).resolve().is_relative_to(tmp_path.resolve())
     assert read_yield(tmp_path, shard).valid == 2
+
+
+@pytest.mark.parametrize("folder", ["hands of " + "a" * 240, "机械手" * 10])
+def test_names_that_are_too_long_for_a_folder_are_refused_before_the_work(tmp_path, folder):
+    (file := tmp_path / folder / "mine.urdf").parent.mkdir()
+    file.write_text("<robot/>")
+    with pytest.raises(OptionError, match=r"is too long: .*Give a shorter path"):
+        require_known([str(file)], [])
 
 
 def test_an_empty_shard_counts_as_done(tmp_path):

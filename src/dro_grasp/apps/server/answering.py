@@ -51,6 +51,7 @@ from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress
 from dro_grasp.predict.stages import evaluate
+from dro_grasp.simulation.protocols import protocol
 
 MAX_PROBLEMS = 8  # Most pairs of hand and object, with constraints, of which all that was derived stays (ours)
 MAX_CANDIDATES = 1_000  # Most candidates of one request (ours): a server answers robots, `generate` fills files
@@ -106,8 +107,13 @@ class Answerer:
         if isinstance(call, GenerateCall):
             return self._generated(call, problem, request, time.perf_counter() - begin, progress)
         hand, obj = problem.hand, problem.obj
-        if call.protocol is not None and obj.is_cloud:
-            raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
+        if call.protocol is not None:
+            protocol(call.protocol)  # an unknown one is refused before the work
+            if obj.is_cloud:
+                raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it "
+                                  "out")
+        if not obj.is_cloud:
+            obj.cut(progress)
         loaded = time.perf_counter() - begin
         made = self.predictor.run(problem, request, progress)
         middle = time.perf_counter()
@@ -130,16 +136,16 @@ class Answerer:
         if not obj.is_cloud:
             obj.cut(progress)
         made = self.predictor.run(problem, request, progress)
-        begin, protocol = time.perf_counter(), protocol_for(obj, call.protocol)
+        begin, rules = time.perf_counter(), protocol_for(obj, call.protocol)
         own = self.library.own["object"].get(call.object.name or "")
         path = call.path if own is None else object_file(own)
         # The command's predictor records the file of an object that no camera saw, which has none here.
         grasps = recorded(made.grasps, None, None if call.camera else path, call.object.scale)
-        grasps = grasps if protocol == NO_TRIAL else evaluate(problem, grasps, protocol, progress)
+        grasps = grasps if rules == NO_TRIAL else evaluate(problem, grasps, rules, progress)
         trial = time.perf_counter() - begin if bool(grasps.evaluated.any()) else 0.0
         frame = "object" if call.camera is None else call.camera.frame
         told = told_of(obj, made, grasps, hand=hand.name, num=request.num, seed=request.seed,
-                       weights=self.predictor.weights_name, protocol=protocol, frame=frame)
+                       weights=self.predictor.weights_name, protocol=rules, frame=frame)
         odd = [doubt(problem.constraints, obj, call.camera is not None), made.shortage]
         kept = grasps[grasps.success] if call.only_successful else grasps
         camera = None if call.camera is None else NamedMotion(call.camera.frame, sent_pose(call.camera).float())

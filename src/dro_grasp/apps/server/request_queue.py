@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections import Counter
@@ -70,10 +71,10 @@ class Computer:
     cancelled: Any  # Number of the request that was cancelled last, in memory that the server's process writes
 
     @classmethod
-    def prepare(cls, cancelled: Any) -> None:
-        """Start the process."""
+    def prepare(cls, cancelled: Any, folder: str) -> None:
+        """Start the process, with a folder for all temporary files."""
         end_with_parent()
-        cls.cancelled = cancelled
+        cls.cancelled, tempfile.tempdir = cancelled, folder
 
     @classmethod
     def load(cls, answerer: Callable[[Any], Any], config: Any) -> Ready:
@@ -276,7 +277,7 @@ class RequestQueue:
         if not alive:
             self._end()
             if not self.closed:
-                with suppress(DroGraspError):  # the next request tells
+                with suppress(Exception):  # the next request tells
                     self._start()
 
     def _forget(self, request: Request, reply: Reply) -> None:
@@ -302,7 +303,7 @@ class RequestQueue:
         except TimeoutError:
             return refused(HTTPStatus.GATEWAY_TIMEOUT, f"the request took longer than {self.time_limit:g} s and was ended; ask "
                                                        "for fewer grasps or candidates"), False
-        except (ProcessExpired, BrokenProcessPool, RuntimeError, DroGraspError) as error:
+        except Exception as error:  # of the process, or of a system that can start none
             if self._stops(error):
                 return STOPPED, False
             if _was_killed(error) and not again:
@@ -322,7 +323,9 @@ class RequestQueue:
     def _start(self) -> None:
         """Start the process, and wait until it has loaded; raises what loading raises."""
         self.metrics.starts += 1
-        self._pool = ProcessPool(1, initializer=Computer.prepare, initargs=(self._cancelled,), context=self._context)
+        self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-", ignore_cleanup_errors=True)
+        self._pool = ProcessPool(
+            1, initializer=Computer.prepare, initargs=(self._cancelled, self._folder.name), context=self._context)
         try:
             self.ready: Ready = self._pool.schedule(Computer.load, (self.answerer, self.config)).result()
         except (ProcessExpired, BrokenProcessPool) as error:
@@ -333,10 +336,14 @@ class RequestQueue:
             raise
 
     def _end(self) -> None:
-        """End the process, whatever it does; one caller after the other, as a pool's pipes may be closed by one thread only."""
+        """End the process, whatever it does, and remove its temporary files.
+
+        One caller comes after the other, as a pool's pipes may be closed by one thread only.
+        """
         with self._ending:
             self._pool.stop()
             self._pool.join()
+            self._folder.cleanup()
 
 
 def _was_killed(error: BaseException) -> bool:

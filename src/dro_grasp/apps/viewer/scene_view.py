@@ -432,7 +432,7 @@ class ServedPage:
             raise OptionError(f"host is empty; give host={HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
             # viser would search for a free port forever.
-            socket.create_server((host, 0)).close()
+            socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
         except OSError as error:
             raise OptionError(f"this machine cannot serve at '{host}' ({error}); give host={HOST} for this machine only, or "
                               "0.0.0.0 for the whole network") from error
@@ -448,7 +448,8 @@ class ServedPage:
     def url(self) -> str:
         """Address of the page for a browser, with the token if it needs one."""
         token = "" if self.token is None else f"/?token={quote(self.token, safe='')}"
-        return f"http://{self.server.get_host()}:{self.server.get_port()}{token}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}{token}"
 
     def stop(self) -> None:
         """Stop serving and free the port."""

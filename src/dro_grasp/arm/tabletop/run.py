@@ -6,6 +6,7 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from pebble import ProcessExpired, ProcessPool
 from dro_grasp.arm.planning.motion import MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts, write_attempts
+from dro_grasp.arm.tabletop.attempts import Attempt, read_attempts, sole_writer, write_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig, Watcher, attempt, require_mesh
 from dro_grasp.arm.tabletop.table_scene import PickedObject
 from dro_grasp.devices import cores
@@ -94,17 +95,26 @@ def run_tabletop(
         ObjectError: An object cannot be used.
         WeightsError: The weights cannot be used.
         GraspFileError: `output` is there and is no such file.
-        OutputError: `output` or `plans` cannot be written.
+        OutputError: `output` or `plans` cannot be written, or another run is storing attempts in `output`.
     """
     require_extra("arm")
     if workers < 1:
         raise OptionError(f"workers is {workers}; give at least 1")
-    stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
+    output = None if output is None else check_output(output, ".parquet")
+    with nullcontext() if output is None else sole_writer(output):
+        return _run_tabletop(run, output, workers, progress, plans, make or attempt)
+
+
+def _run_tabletop(
+    run: TabletopRun, output: Path | None, workers: int, progress: Callable[[Attempt], None] | None, plans: Path | None,
+    make: Callable[..., Attempt],
+) -> list[Attempt]:
+    stored = read_attempts(output) if output is not None and output.exists() else []
     done, names = _done(run, stored, output)
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
-    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make or attempt):
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make):
         stored.append(result)
         done[result.object, result.number] = result
         if output is not None:

@@ -184,10 +184,12 @@ def filter_dataset(
     sound_sources(pair.grasps for pair in given if len(pair.grasps))
     folder = make_folder(output)
     tasks = _tasks(given)
-    with sole_run(folder):
+    with sole_run(folder, mergeable=True):
         _begin(folder, config)
         remove_leftovers(folder)
         missing = [task for task in tasks if not _done(folder, task, say or (lambda line: None))]
+        if missing:
+            _part(folder, given)
         given_up: dict[tuple[str, str], str] = {}
         sizes = {task.shard: len(pair.grasps) for task, pair in zip(tasks, given, strict=True)}
         done = sum(sizes.values()) - sum(sizes[task.shard] for task in missing)
@@ -284,6 +286,12 @@ def _results(
                     yield task, result
     finally:
         pool.close()
+
+
+def _part(folder: Path, given: Sequence[PairGrasps]) -> None:
+    """Remove the files that an earlier run joined: beside them, what is added before the end would not be read."""
+    for hand in {pair.grasps.hand for pair in given} | {shard.hand for shard in find_shards(folder)}:
+        (folder / file_name(hand)).unlink(missing_ok=True)
 
 
 def _join(folder: Path, shards: Sequence[Shard]) -> None:

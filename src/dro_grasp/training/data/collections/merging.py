@@ -31,6 +31,7 @@ UNIT_STEP = 2.0**-15  # Grid of quaternions in merged files. Ours: 0.03 mrad
 MANTISSA = 10
 """Bits of the mantissa of scores, energies, distances and angles of trials, and further columns. Ours: three digits."""
 FILE_BYTES = 100_000_000  # Size of a merged file from which on the next object goes into another [bytes] (ours)
+ASIDE = ".merge-"  # How the names of folders begin in which grasps wait
 PLAIN_COLUMNS = (REASON, FAILURE)  # Columns that are empty for successes
 EXACT = (OBJECT_SCALE, OBJECT_MASS, CAMERA)  # Further columns without which the object is not found again
 
@@ -81,7 +82,7 @@ def merge(
         file_bytes: Size of a file from which on the next object goes into another, about.
     """
     require_choice(per_pair)
-    with tempfile.TemporaryDirectory(dir=aside, prefix=".merge-") as name:
+    with tempfile.TemporaryDirectory(dir=aside, prefix=ASIDE) as name:
         for hand, pairs in sorted(_by_pair(paths, Path(name)).items()):
             yield from _merge_hand(hand, pairs, per_pair, file_bytes)
 

@@ -32,6 +32,7 @@ from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_sha
 from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
 
 REPORT_EVERY = 10.0  # Time between lines of progress [s]. Ours
+LONGEST_NAME = 255  # Longest name of a folder that file systems take [bytes]
 CANDIDATE_STEP = 64  # Shards have a multiple of this many candidates. Ours
 CANDIDATES_PER_GRASP = 8  # Candidates of a first shard for each grasp that is asked for, before a yield is known. Ours
 Pair = tuple[str, str]
@@ -122,7 +123,7 @@ def synthesize_dataset(
         require_device(config.synthesis.device)
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
-    with sole_run(folder, config.shard):
+    with sole_run(folder, config.shard, mergeable=True):
         job = Job(seed, config)
         require_settings(folder, job)
         states = {pair: PairState() for pair in own_pairs(hands, objects, config.shard)}
@@ -151,6 +152,10 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
     for obj in objects:
         if obj.removeprefix(ASSET_PREFIX) not in names and not given_path(obj).is_file():
             load_object(obj)  # likewise
+    for name in (*hands, *objects):
+        if (size := max(len(part) for part in Shard(name, name, 0).path(Path()).parts)) > LONGEST_NAME:
+            raise OptionError(f"'{name}' is too long: the folder of its grasps would have a name of {size} characters, of "
+                              f"{LONGEST_NAME} at most. Give a shorter path, such as one from the file's own folder")
 
 
 def require_distinct(hands: Sequence[str], objects: Sequence[str]) -> None:

@@ -160,25 +160,28 @@ def read_yield(folder: Path, shard: Shard) -> Yield:
 
 
 @contextmanager
-def sole_run(folder: Path, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
-    """Keep a second run of the same part out of a folder while the block lasts, and runs that divide the work otherwise."""
+def sole_run(folder: Path, part: tuple[int, int] = (1, 1), mergeable: bool = False) -> Iterator[None]:
+    """Keep a second run of the same part out of a folder while the block lasts, and runs that divide the work otherwise.
+
+    OutputError: one is at work; of `mergeable` results it says how they join those of another folder.
+    """
     suffix = "" if part[1] == 1 else f"-{part[0]}-of-{part[1]}"
     lock = FileLock(folder / f"{LOCK}{suffix}", timeout=0, fallback_to_soft=False)
     fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)} - {LOCK + suffix}
     try:
-        _take(lock, folder)
+        _take(lock, folder, mergeable)
         with suppress(OSError):  # on a full disk the first shard tells
             (folder / f"{HOLDER}{suffix}").write_text(f"{os.getpid()} on {socket.gethostname()}")
         for other in sorted({path.name for path in folder.glob(f"{LOCK}*")} - fellows - {LOCK + suffix}):
             rival = FileLock(folder / other, timeout=0, fallback_to_soft=False)
-            _take(rival, folder)
+            _take(rival, folder, mergeable)
             rival.release()
         yield
     finally:
         lock.release()
 
 
-def _take(lock: FileLock, folder: Path) -> None:
+def _take(lock: FileLock, folder: Path, mergeable: bool) -> None:
     """Acquire a lock where the file system has locks, unless another run holds it."""
     try:
         lock.acquire()
@@ -187,8 +190,9 @@ def _take(lock: FileLock, folder: Path) -> None:
         holder = folder / name.replace(LOCK, HOLDER)
         process = holder.read_text() if holder.exists() else "unknown"
         part = f" as part {name.removeprefix(LOCK + '-').replace('-of-', ' of ')}" if name != LOCK else ""
+        join = " and join both with `dro-grasp dataset merge`" if mergeable else ""
         raise OutputError(f"another run is filling {folder}{part} (process {process}); wait for it, or give another "
-                          "folder and join both with `dro-grasp dataset merge`") from error
+                          f"folder{join}") from error
     except OSError:
         pass  # a file system without locks
 
