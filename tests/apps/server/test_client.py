@@ -72,6 +72,22 @@ def test_numbers_may_be_arrays_and_tensors(client: dro.GraspClient, sent: list[A
         np.testing.assert_array_equal(np.load(io.BytesIO(part.file.content)), points)
 
 
+def test_a_server_on_this_machine_is_asked_without_a_proxy(
+    client: dro.GraspClient, sent: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    client.predict("gripper3", "can")
+    assert len(sent) == 1
+
+
+@pytest.mark.parametrize("token", ["令牌", "schlüssel", "two\nlines"])
+def test_a_token_that_cannot_be_sent_is_refused(token: str) -> None:
+    with pytest.raises(OptionError, match="token holds characters that a header cannot bear"):
+        dro.GraspClient(token=token)
+
+
 def test_none_is_as_if_it_were_left_out(client: dro.GraspClient, sent: list[Any]) -> None:
     nothing = dict.fromkeys(("obstacles", "camera", "direction", "table", "max_tilt", "protocol"))
     for options in (nothing, {}):

@@ -12,8 +12,10 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError, URLError
-from urllib.request import Request, urlopen
+from urllib.parse import urlsplit
+from urllib.request import ProxyHandler, Request, build_opener
 
+from dro_grasp.apps.origins import LOCAL
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import given_path, reason_of
 from dro_grasp.kinds import checked
@@ -40,7 +42,13 @@ class GraspClient:
             url: Address of the server.
             token: What the server demands, if it has one.
             timeout: Longest wait for an answer [s].
+
+        Raises:
+            OptionError: The token cannot be sent.
         """
+        if token and not (token.isascii() and token.isprintable()):
+            raise OptionError("token holds characters that a header cannot bear; give the server and its clients one of ASCII "
+                              "letters, digits and signs")
         self.url, self.timeout = url.rstrip("/"), timeout
         self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
 
@@ -94,7 +102,9 @@ class GraspClient:
 
     def _asked(self, method: str, page: str, body: bytes | None) -> Any:
         try:
-            with urlopen(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
+            here = urlsplit(self.url).hostname in LOCAL  # no proxy reaches this machine's own addresses
+            opener = build_opener(ProxyHandler({})) if here else build_opener()
+            with opener.open(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
                 return json.load(answer)
         except HTTPError as error:
             with error:
