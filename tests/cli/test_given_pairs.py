@@ -20,7 +20,7 @@ from tests.helpers.served_studio import visited
 URDF = (BUILTIN_FOLDER / "gripper3.urdf").read_text()
 COMMANDS = {
     "view": ["view"], "picture": ["picture", "--posture", "grasp", "--output", "sheet.png"],
-    "export": ["export", "--format", "moveit", "--output", "grasps.yaml"],
+    "export": ["export", "--format", "moveit", "--output", "grasps"],
 }
 
 

@@ -48,7 +48,7 @@ def test_the_command_that_shows_it_is_one_for_shells(tmp_path: Path, capsys: pyt
     (["--output", "same.urdf"], "give --mirrored, --scale, or both"),
     (["--mirrored", "--output", "left.xml"], "left.xml: give a name that ends in .urdf, such as left.urdf"),
     (["--mirrored", "--output", "nowhere/left.urdf"], "create it first"),
-    (["--scale", "-1", "--output", "left.urdf"], "factor is -1.0; give a positive number"),
+    (["--scale", "-1", "--output", "left.urdf"], "--scale is -1.0; give a positive number"),
 ])
 def test_what_cannot_be_written_is_refused_in_words(
     options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

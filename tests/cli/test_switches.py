@@ -24,6 +24,8 @@ from dro_grasp.cli.switches import in_switches, use_options_of
 from dro_grasp.cli.view import View
 from dro_grasp.errors import UngraspableError
 from dro_grasp.objects.perception.things import AS_SCENE
+from dro_grasp.predict.sources.registry import make_source
+from dro_grasp.simulation.outcome import MORE
 from dro_grasp.simulation.scene import require_simulable
 
 SOURCE = Path(__file__).parents[2] / "src" / "dro_grasp"
@@ -96,6 +98,38 @@ def test_a_command_is_told_of_its_own_options_alone(told: str, generated: str, p
         assert in_switches(told) == planned
     finally:
         use_options_of(None)
+
+
+def test_what_was_typed_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for typed in (["--object", "seed=3.stl"], ["--object=seed=3.stl"]):
+        assert main(["generate", "--hand", "gripper3", *typed]) == 2
+        assert "no object file at seed=3.stl; " in capsys.readouterr().err
+    assert main(["generate", "--hand", "gripper3", "--object", "can", "--num=0"]) == 2
+    assert "(--num 16)" in capsys.readouterr().err
+    assert in_switches("of seed=3.stl") == "of --seed 3.stl", "of the command that runs alone"
+
+
+@pytest.mark.parametrize(("told", "evaluated"), [
+    (MORE, "propose more candidates for each grasp (`dro-grasp generate --candidates 16`), or take them from the optimiser "
+           "(`dro-grasp generate --source optimiser`)"),
+])
+def test_what_another_command_can_be_told_is_named_with_it(told: str, evaluated: str) -> None:
+    try:
+        use_options_of(Evaluate(Path("g.parquet")))
+        assert in_switches(told) == evaluated
+    finally:
+        use_options_of(None)
+
+
+def test_sources_are_told_in_words_that_every_command_has(tmp_path: Path) -> None:
+    with pytest.raises(dro.DroGraspError) as told:
+        make_source("meen-grasp")
+    assert "mean-grasp" not in str(told.value).replace("meen-grasp", ""), "without a bundle, it cannot be chosen"
+    hand, can = dro.load_hand("gripper3"), dro.load_object("can")
+    dro.GraspBatch.create(hand, can, np.eye(4)[None], hand.canonical_joints()[None]).save(tmp_path / "g.parquet")
+    with pytest.raises(dro.DroGraspError, match="holds no grasp of 'mug', but of can; ask for grasps of one of these"):
+        make_source(str(tmp_path / "g.parquet")).propose(dro.GraspProblem(hand, dro.load_object("mug")), 1, 0)
 
 
 CHOICE = "--nearest, --at X Y Z or --pixel U V"

@@ -13,7 +13,7 @@ from PIL import Image
 
 from dro_grasp.cli import view
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OutputError
+from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.geometry.rendering.rasterizer import Camera, render
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import complete
@@ -189,6 +189,16 @@ def test_unwritable_path_and_no_grasps_are_refused(hand, obj, grasps, tmp_path: 
         draw_grasps(hand, obj, grasps[slice(0, 0)], tmp_path / "a.png")
 
 
+def test_pictures_of_nothing_are_refused(hand, obj, grasps, tmp_path: Path) -> None:
+    for wrong, told in (({"columns": -2}, "columns is -2"), ({"columns": 0}, "columns is 0"), ({"count": -1}, "count is -1")):
+        with pytest.raises(OptionError, match=told):
+            draw_grasps(hand, obj, grasps, tmp_path / "a.png", **wrong)
+    for style, told in (({"size": (0, 0)}, r"size is \(0, 0\)"), ({"opacity": 5.0}, r"opacity is 5\.0")):
+        with pytest.raises(OptionError, match=told):
+            PictureStyle(**style)
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_a_transparent_object_is_between_none_and_a_solid_one(hand, obj, grasps) -> None:
     solid, half, none = (draw_grasp(hand, obj, grasps, 0, PictureStyle(opacity=a)).astype(int) for a in (1.0, 0.5, 0.0))
     assert np.abs(2 * half - solid - none).max() <= 2
@@ -219,11 +229,12 @@ def file(grasps: GraspBatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["--count", "0"], "error: --count is 0; give at least 1\n"),
-        (["--columns", "-1"], "error: --columns is -1; give at least 1\n"),
-        (["--size", "100000", "100000"], "error: --size is 100000 100000; give a width and a height of 1 to 4096 pixels\n"),
-        (["--size", "0", "100"], "error: --size is 0 100; "),
-        (["--opacity", "nan"], "error: --opacity is nan; give a number from 0 to 1\n"),
+        (["--count", "0"], "error: count is 0; give at least 1 (--count)\n"),
+        (["--columns", "-1"], "error: columns is -1; give at least 1 (--columns)\n"),
+        (["--size", "100000", "100000"],
+         "error: size is (100000, 100000); give a width and a height of 1 to 4096 pixels (--size)\n"),
+        (["--size", "0", "100"], "error: size is (0, 100); "),
+        (["--opacity", "nan"], "error: opacity is nan; give a number from 0 to 1 (--opacity)\n"),
         (["--output", "p.svg"], "p.svg: give a name that ends in .png, such as p.png\n"),
         (["--output", "p"], "p: give a name that ends in .png"),
     ],

@@ -105,6 +105,11 @@ class Synthesize:
             raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
         if not 0 < self.confirm <= 1:
             raise OptionError(f"--confirm is {self.confirm}; give a share above 0 and up to 1, which judges all")
+        if self.confirm != 1 and self.device == "cpu":
+            raise OptionError(f"--confirm is {self.confirm:g}, of what passes on another device; name it with --device, or "
+                              "leave out --confirm")
+        if self.ray_address is not None and self.engine != "ray":
+            raise OptionError("--ray-address is that of a Ray cluster; add --engine ray, or leave it out")
         if not 0 <= self.idle <= 1:
             raise OptionError(f"--idle is {self.idle}; give a probability, from 0 (every finger holds) to 1")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,6 +129,8 @@ class Vary:
 
         if not self.mirrored and self.scale == 1:
             raise OptionError("nothing would change; give --mirrored, --scale, or both")
+        if not 0 < self.scale < math.inf:
+            raise OptionError(f"--scale is {self.scale}; give a positive number, for example 1.2")
         path = check_output(self.output, ".urdf")
         if path.exists() and path.samefile(locate_hand(self.hand).path):
             raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")

@@ -98,7 +98,7 @@ def run(arguments: Sequence[str]) -> int:
             print(f"dro-grasp {__version__}")
             return DONE
         command = parse(without_threads(arguments))
-        use_options_of(command)
+        use_options_of(command, arguments)
         return command.run()
     finally:
         print(end="", flush=True)  # what nobody reads fails here rather than while Python ends

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any
@@ -14,6 +14,8 @@ ARGUMENT = re.compile(r"(?<![\w.`'/+-])([a-z][a-z0-9_]*)=(\.\.\.|\([^()\n]*\)|'[
 INSTEAD = {
     "scale": ("a file in metres", "a file with all coordinates times {}"),
     "keep_table": ("load_object with keep_table in Python", "load_object(..., keep_table={}) in Python"),
+    "candidates": ("`dro-grasp generate --candidates N`", "`dro-grasp generate --candidates {}`"),
+    "source": ("`dro-grasp generate --source NAME`", "`dro-grasp generate --source {}`"),
     "camera": ("`dro-grasp generate --camera JSON`", "`dro-grasp generate --camera {}`"),
     "direction": ("`dro-grasp generate --direction X Y Z`", "`dro-grasp generate --direction {}`"),
     "only_successful": ("--only-successful", "--only-successful"),
@@ -25,11 +27,16 @@ AS_SCENE = re.compile(r"\((scene=FILE camera=JSON)(, and )(nearest=True, at=\(X,
 """How a cloud is given as a scene and one thing of it is chosen, as the package says it (objects/perception/things.py)."""
 
 _running: list[frozenset[str]] = []  # Options of the command that runs; empty while none does
+_given: list[str] = []  # What was typed for it that may read like an argument, such as the path `seed=3.csv`
 
 
-def use_options_of(command: Any | None) -> None:
-    """From now on, let messages speak of the options of this command alone; of those of all commands for None."""
+def use_options_of(command: Any | None, typed: Sequence[str] = ()) -> None:
+    """From now on, let messages speak of the options of this command alone; of those of all commands for None.
+
+    What was typed for it stays as it is.
+    """
     _running[:] = [] if command is None else [frozenset(_names(command))]
+    _given[:] = [word.partition("=")[2] if word.startswith("--") else word for word in typed]
 
 
 def in_switches(text: str) -> str:
@@ -52,6 +59,8 @@ def _scene(found: re.Match[str]) -> str:
 
 def _switch(found: re.Match[str]) -> str:
     name, value = found.groups()
+    if any(found[0] in word for word in _given):
+        return found[0]
     if name in (_running[0] if _running else _options()):
         return _typed(name, value)
     if _running and name in INSTEAD:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from dro_grasp.objects.perception.scene_files import SceneCamera
     from dro_grasp.objects.shape import ObjectModel
 
-MAX_SIDE = 4096  # Largest width and height of one picture [pixels]
 MAX_PIXELS = 50_000_000  # Most pixels of all pictures on a sheet together
 
 
@@ -79,12 +78,13 @@ class View:
             (show or serve)(StudioServer(self._of_scene(self.scene), self.port, self.host, token))
             return 0
         motion = self.file is not None and is_motion(self.file)
-        idle = {"--hand": self.hand, "--object": self.object} if motion else {
-            "--robot": self.robot, "--attempt": self.attempt or None}
-        if given := [option for option, value in idle.items() if value is not None]:
-            raise OptionError(f"{' and '.join(given)} {'are' if given[1:] else 'is'} for "
-                              + ("grasps, and the file holds a motion" if motion else "motions of an arm, or for --scene")
-                              + "; leave it out")
+        if self.file is not None and motion:
+            self._refuse("grasps, and the file holds a motion", "hand", "object", "scale", "device")
+            if self.file.suffix.lower() == ".npz":
+                self._refuse("attempts, and the file holds none", "attempt", "weights")
+        else:
+            self._refuse("motions of an arm, or for --scene", "robot", "attempt")
+            require_object(self.scale, self.object)
         if self.file is not None and motion:
             require_extra("arm")
             from dro_grasp.apps.viewer.clear_page import clear_page
@@ -102,12 +102,19 @@ class View:
                                       token))
         return 0
 
+    def _refuse(self, what: str, *options: str) -> None:
+        """Refuse options that are for something else, by an OptionError."""
+        usual = {field.name: field.default for field in fields(self)}
+        if given := [f"--{name}" for name in options if getattr(self, name) != usual[name]]:
+            raise OptionError(f"{' and '.join(given)} {'are' if given[1:] else 'is'} for {what}; leave it out")
+
     def _check_scene(self) -> None:
         """Refuse options that contradict one another, by an OptionError."""
         if self.scene is None:
             if self.camera is not None:
                 raise OptionError("--camera is that of a scene; give the scene, too: --scene CLOUD|DEPTH")
             return
+        self._refuse("attempts of an arm, which are in a file", "attempt")
         for option, value in (("FILE", self.file), ("--object", self.object)):
             if value is not None:
                 raise OptionError(f"--scene and {option} are given; leave out one of them: the thing is chosen on the page")
@@ -206,9 +213,11 @@ class Picture:
         """Load the file and draw."""
         from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
-        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
+        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet, require_sheet
 
-        self._check_options()
+        require_object(self.scale, self.object)
+        require_sheet(self.count, self.columns)
+        style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
         check_output(self.output, ".png")
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
@@ -219,7 +228,6 @@ class Picture:
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
                               f"sheet has at most {MAX_PIXELS // 10**6} million: give a smaller --size or --count")
-        style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
         draw_sheet(hand, pairs, self.output, self.columns, style)
         say_file("picture", self.output)
         return 0
@@ -240,16 +248,6 @@ class Picture:
             of = "" if self.object is None else f" of {self.object}"
             raise GraspFileError(f"no grasp{of} in {self.file} has passed a trial; leave out --only-successful")
         return pairs
-
-    def _check_options(self) -> None:
-        require_object(self.scale, self.object)
-        for option, value in (("--count", self.count), ("--columns", self.columns)):
-            if value < 1:
-                raise OptionError(f"{option} is {value}; give at least 1")
-        if not (min(self.size) >= 1 and max(self.size) <= MAX_SIDE):
-            raise OptionError(f"--size is {self.size[0]} {self.size[1]}; give a width and a height of 1 to {MAX_SIDE} pixels")
-        if not 0 <= self.opacity <= 1:
-            raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
 
 
 TOKEN = "DRO_GRASP_TOKEN"  # Environment variable of the token, which others cannot read in a list of processes

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from dro_grasp.devices import cores
-from dro_grasp.errors import OutputError
+from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.files import replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, dots, render
 from dro_grasp.grasps.batch import GraspBatch, percent
@@ -31,6 +31,7 @@ from dro_grasp.simulation import trial
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 TILE = (320, 280)  # Width and height of the picture of one grasp [pixels]
+MAX_SIDE = 4096  # Largest width and height of one picture [pixels]
 PIXELS_AT_ONCE = 2048 * 2048  # Pixels that are drawn side by side (ours): bounds the memory
 CONTACT_DISTANCE = 0.002  # Hand points closer than this to the object's surface count as contacts [m]
 CONTACT_RADIUS = 0.0022  # Radius of a contact mark [m]
@@ -56,6 +57,21 @@ class PictureStyle(Checked):
     """Hand and object after the hand has closed in a trial, or the grasp itself, which closing starts from; `draw_grasp` draws
     the joints and poses that it is given."""
 
+    def __post_init__(self) -> None:
+        """Refuse sizes and opacities out of range: OptionError."""
+        super().__post_init__()
+        if not (min(self.size) >= 1 and max(self.size) <= MAX_SIDE):
+            raise OptionError(f"size is {self.size}; give a width and a height of 1 to {MAX_SIDE} pixels (size=...)")
+        if not 0 <= self.opacity <= 1:
+            raise OptionError(f"opacity is {self.opacity}; give a number from 0 to 1 (opacity=...)")
+
+
+def require_sheet(count: int, columns: int) -> None:
+    """Refuse a sheet of no picture, or of none side by side: OptionError."""
+    for name, number in (("count", count), ("columns", columns)):
+        if number < 1:
+            raise OptionError(f"{name} is {number}; give at least 1 ({name}=...)")
+
 
 Tile = tuple[UInt8[np.ndarray, "height width 3"], str, bool | None]
 """A picture, its caption, and the trial outcome that gives its colour."""
@@ -72,9 +88,11 @@ def draw_grasps(
     the grasps themselves or the hand came without its description. Links above the hand's palm are not drawn.
 
     Raises:
+        OptionError: `count` or `columns` is not positive.
         OutputError: The file cannot be written, or there is no grasp.
     """
     require_pair(hand, obj)
+    require_sheet(count, columns)
     closed = ", drawn after closing" if shows_held(hand, style) else ""
     _save(_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
 
@@ -86,11 +104,14 @@ def draw_sheet(
     """Write a PNG with pictures of all given grasps, of one object or several, as `draw_grasps` draws them.
 
     Raises:
+        OptionError: `columns` is not positive.
         OutputError: The file cannot be written, or there is no grasp.
     """
+    count = max(1, sum(len(grasps) for _, grasps in pairs))
+    require_sheet(count, columns)
     if len(pairs) == 1:
         (obj, grasps), = pairs
-        return draw_grasps(hand, obj, grasps, path, len(grasps), columns, style)
+        return draw_grasps(hand, obj, grasps, path, count, columns, style)
     tiles = [(tile, f"{obj.name}   {text}", passed) for obj, grasps in pairs
              for tile, text, passed in _tiles(hand, obj, grasps, style)]
     together = GraspBatch.concatenate([grasps for _, grasps in pairs])

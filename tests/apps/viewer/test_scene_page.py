@@ -293,6 +293,10 @@ def written(made: MadeScene, folder: Path) -> tuple[Path, Path]:
     (("--scene", "depth.png"), "is a depth image; give its camera"),
     (("--robot", "xarm7_leaphand"), "--robot is for motions of an arm, or for --scene; leave it out"),
     (("--attempt", "3"), "--attempt is for motions of an arm"),
+    (("--scene", "depth.png", "--attempt", "5"), "--attempt is for attempts of an arm, which are in a file; leave it out"),
+    (("plan.npz", "--scale", "-1", "--device", "tpu"), "--scale and --device are for grasps, and the file holds a motion"),
+    (("plan.npz", "--attempt", "7", "--weights", "nope"), "--attempt and --weights are for attempts, and the file holds none"),
+    (("grasps.parquet", "--scale", "2"), "name the object, too: --object NAME|PATH"),
 ])
 def test_options_that_contradict_one_another_are_refused(
     made: MadeScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],

@@ -361,7 +361,7 @@ def test_a_time_that_is_none_is_refused(tmp_path, seconds):
     ("option", "value"),
     [("--hand", "nowhere.urdf"), ("--hand", "barret"), ("--object", "nope.stl"), ("--object", "mugg"), ("--minutes", "-1"),
      ("--minutes", "0"), ("--minutes", "nan"), ("--grasps", "0"), ("--workers", "0"), ("--scale", "nan"), ("--idle", "1.5"),
-     ("--idle", "nan")],
+     ("--idle", "nan"), ("--confirm", "0.5")],
 )
 def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, option, value):
     monkeypatch.setattr(engine, "synthesize_dataset", None)
@@ -371,6 +371,13 @@ def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, opt
     assert value in told
     assert told.startswith(f"error: {option} is " if option not in {"--hand", "--object"} else "error: no")
     assert not (tmp_path / "sy").exists()
+
+
+def test_the_address_of_a_cluster_needs_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(engine, "synthesize_dataset", None)
+    given = ["synthesize", "--hand", "barrett", "--object", "mug", "--output", str(tmp_path / "sy")]
+    assert main([*given, "--ray-address", "auto"]) == 2
+    assert "--ray-address is that of a Ray cluster; add --engine ray, or leave it out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -103,8 +103,8 @@ class FileSource(Source):
             return self.grasps[:0].replace(asked_of=asked)  # an answer of nothing
         if not parts:
             held = ", ".join(sorted(set(self.grasps.object))[:5])
-            raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with "
-                                 "objects=...")
+            raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; ask for "
+                                 "grasps of one of these, or give another file")
         return GraspBatch.concatenate(parts)
 
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:

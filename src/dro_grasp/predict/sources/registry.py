@@ -77,8 +77,9 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
     module, colon, attribute = name.partition(":")
     if colon:
         return _as_source(name, _made(name, _own_class(module, attribute)))
-    raise OptionError(f"there is no source '{name}'; choose {', '.join((AUTO, *source_names(), *WITH_DATA))}, name a class "
-                      "of your own as module:Class, or give a grasp file (.parquet)")
+    names = AUTO, *source_names(), *(() if means is None else WITH_DATA)
+    raise OptionError(f"there is no source '{name}'; choose {', '.join(names)}, name a class of your own as module:Class, or "
+                      "give a grasp file (.parquet)")
 
 
 def _made(name: str, factory: Any) -> Any:
