@@ -127,6 +127,16 @@ def test_jaws_that_slide_the_same_way_are_warned_of(tmp_path: Path, axis: str, w
     assert bool(found) == warned
 
 
+@pytest.mark.parametrize(("farthest", "warned"), [(0.028, False), (0.03, False), (0.05, True), (0.08, True)])
+def test_jaws_that_slide_into_each_other_are_warned_of(tmp_path: Path, farthest: float, warned: bool) -> None:
+    """They meet at 2.9 cm; where they slide past each other, they are apart again when closed."""
+    limits = f'<limit lower="0" upper="{farthest}" effort="9" velocity="1"/>'
+    joints = joint("a", "palm", "left", "-0.035 0 0.01", "1 0 0", limits, "prismatic") + joint(
+        "b", "palm", "right", "0.035 0 0.01", "-1 0 0", limits + '<mimic joint="a"/>', "prismatic")
+    found = [note for note in check_hand(written(tmp_path, claw(joints=joints))).notes if "slide into each other" in note.text]
+    assert [(note.level, note.subject) for note in found] == [("warning", "left, right")] * warned
+
+
 def test_the_variants_are_the_same_mechanism(folder: Path) -> None:
     """Links are where they were, for values in other words; so the oracle above is one."""
     for name in ("gripper3", 911):

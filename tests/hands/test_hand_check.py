@@ -22,6 +22,29 @@ def test_a_lost_mesh_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
     assert any(n.subject == "left" and "'package://x/lost.stl' was not found" in n.text for n in report.notes)
 
 
+def union(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> trimesh.Trimesh:
+    """One mesh of boxes, each by its sizes and its middle."""
+    return trimesh.boolean.union([
+        trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes], engine="manifold")
+
+
+def test_a_base_that_its_hull_fills_up_is_told(tmp_path: Path) -> None:
+    union(((0.16, 0.06, 0.02), (0, 0, 0)), *(((0.01, 0.06, 0.04), (side * 0.075, 0, 0.015)) for side in (1, -1))).export(
+        tmp_path / "u.stl")
+    text = claw().replace('<box size="0.08 0.08 0.02"/>', '<mesh filename="u.stl"/>')
+    told = [note for note in check_hand(written(tmp_path, text)).notes if "convex hull" in note.text]
+    assert [(note.level, note.subject) for note in told] == [("info", "palm")]
+    assert not any("convex hull" in note.text for note in check_hand(written(tmp_path, claw(), "plain.urdf")).notes)
+
+
+def test_a_hand_that_encloses_nothing_as_its_base_is_filled_up_says_so(tmp_path: Path) -> None:
+    union(((0.08, 0.03, 0.03), (0, 0, -0.015)), ((0.012, 0.03, 0.08), (-0.034, 0, 0.039))).export(tmp_path / "l.stl")
+    limit = '<limit lower="-0.45" upper="0.6" effort="2" velocity="1"/>'
+    text = claw(links=link("jaw", '<box size="0.012 0.03 0.08"/>'), joints=joint("a", "palm", "jaw", "0.034 0 0", more=limit))
+    with pytest.raises(HandError, match=r"enclose no space.*; palm: taken as the convex hull of its mesh"):
+        check_hand(written(tmp_path, text.replace('<box size="0.08 0.08 0.02"/>', '<mesh filename="l.stl"/>')))
+
+
 def test_a_hand_whose_moving_links_lost_their_meshes_says_which(tmp_path: Path) -> None:
     gone = '<mesh filename="package://x/lost.stl"/>'
     text = claw(links=link("left", gone) + link("right", gone))

@@ -22,6 +22,7 @@ from dro_grasp.hands.closing import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED, 
 from dro_grasp.hands.description.compiling import HAND, likely_unit
 from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.description.tree_reading import LinkGeometry
+from dro_grasp.hands.doubts import filled_up
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
 from dro_grasp.hands.opening import ROLLING_UP, FingerMotion
@@ -264,7 +265,12 @@ class HandBuilder:
     @cached_property
     def closing(self) -> Closing:
         """From where and to where the joints close, and the palm."""
-        finder, found = self.finder, self.finder.find()
+        finder = self.finder
+        try:
+            found = finder.find()
+        except HandError as error:
+            hulls = [f"{note.subject}: {note.text}" for note in filled_up(self.description)]
+            raise HandError("; ".join([str(error), *hulls])) from error
         # Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
         if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(finder.tree.lower, finder.tree.upper) >= ROLLING_UP:
             with contextlib.suppress(HandError):  # nothing is enclosed so early

@@ -14,13 +14,13 @@ import torch
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
-from dro_grasp.hands.anatomy import Finger
+from dro_grasp.hands.anatomy import PALM, Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.closing import fixed_jaw_of
 from dro_grasp.hands.confidence import LOW, confidence, thumb_confidence
 from dro_grasp.hands.description.compiling import Note, in_lines
-from dro_grasp.hands.description.loader import Description, named
-from dro_grasp.hands.doubts import only_drawn
+from dro_grasp.hands.description.loader import Description, named, self_penetration
+from dro_grasp.hands.doubts import filled_up, only_drawn
 from dro_grasp.hands.effort import effort_notes, find_efforts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
@@ -37,6 +37,8 @@ DOUBT = (200, 20, 20)  # Colour of what a picture says of low confidence
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
 FEWEST_WITH_SIDE = 3  # Hands with fewer fingers are on no side, whatever they are called (ours)
+CLOSINGS = 41  # Postures from open to closed at which jaws are looked at (ours)
+MEETING = 0.003  # How far jaws may slide into each other, as soft ones are made to [m] (ours)
 SAME_WAY = 0.9  # Cosine from which on jaws move the same way (ours)
 END = {1: "upper", -1: "lower"}  # Limit at which a joint is open, by opening sign
 THIN_VOLUME = 1e-9  # Volume below which a link's shapes enclose nothing [m^3] (ours)
@@ -198,15 +200,29 @@ def _sliding_notes(hand: Hand) -> list[Note]:
         return []
     ways = torch.nn.functional.normalize(closed - opened, dim=-1)
     if float((ways @ ways.T).min()) < SAME_WAY:
-        return []
+        return _crossing_notes(hand)
     names = ", ".join(hand.tree.link_names[tip] for tip in hand.tips)
     return [Note("warning", names, "slide the same way when the hand closes, so they hold nothing between them; turn the "
                  "axis of one of their joints, or the sign of its multiplier")]
 
 
+def _crossing_notes(hand: Hand) -> list[Note]:
+    """Jaws whose limits let them slide into each other."""
+    if hand.description is None:
+        return []
+    finger = dict(zip(hand.tree.link_names, hand.finger_of_link.tolist(), strict=True))
+    deepest: dict[tuple[str, str], float] = {}
+    for share in torch.linspace(1, 0, CLOSINGS):
+        for pair, depth in self_penetration(hand.description, hand.canonical_joints(float(share))).items():
+            if PALM not in (own := {finger[name] for name in pair}) and len(own) > 1:
+                deepest[pair] = max(depth, deepest.get(pair, 0.0))
+    return [Note("warning", ", ".join(pair), f"slide into each other by {depth * 1000:.0f} mm when the hand closes; state "
+                 "limits at which they meet") for pair, depth in deepest.items() if depth > MEETING]
+
+
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
     own = hand.tree.descends[:, hand.palm].nonzero()[:, 0].tolist()  # the palm and what hangs on it
-    notes = only_drawn(description, own)
+    notes = [*only_drawn(description, own), *filled_up(description)]
     for link in own:
         shapes = [g for g in description.geometry if g.link == link]
         volume = sum(abs(enclosed_volume(g.vertices[g.faces])) for g in shapes)

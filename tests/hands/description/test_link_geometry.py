@@ -65,6 +65,8 @@ def test_meshes_that_collide_are_hulls_and_others_are_as_drawn(tmp_path) -> None
     hull, ring = (trimesh.Trimesh(s.vertices, s.faces) for s in (colliding, drawn))
     assert hull.volume == pytest.approx(bowl.convex_hull.volume, rel=1e-3)
     assert ring.volume == pytest.approx(bowl.volume, rel=1e-3)
+    assert colliding.fill == pytest.approx(bowl.volume / bowl.convex_hull.volume, rel=1e-3)
+    assert drawn.fill == 1
 
 
 def test_shapes_of_other_bodies_are_left_out() -> None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -14,11 +13,10 @@ import torch
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import HandError
+from dro_grasp.geometry.mesh_files import trimesh
+from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.description.compiling import TURNS, Note
 from dro_grasp.hands.kinematics.tree import FIXED, PRISMATIC, REVOLUTE, KinematicTree
-
-if TYPE_CHECKING:
-    import trimesh
 
 BEYOND = 0.02  # Least motion beyond a follower's own limits that is told [rad or m] (ours)
 NARROWEST = 0.2
@@ -182,6 +180,7 @@ class LinkGeometry:
     faces: Int[np.ndarray, "m 3"]  # vertex indices, counter-clockwise from outside
     collides: bool  # whether it collides in MuJoCo; the mesh of a colliding shape is its convex hull, which MuJoCo uses
     visual: bool  # whether it is drawn
+    fill: float  # share of that hull which its mesh fills; 1 where it is no closed mesh that collides
 
 
 def read_geometry(model: mujoco.MjModel, link_of_body: dict[int, int]) -> tuple[LinkGeometry, ...]:
@@ -193,13 +192,15 @@ def read_geometry(model: mujoco.MjModel, link_of_body: dict[int, int]) -> tuple[
         if body not in link_of_body:
             continue
         collides = _collides(model, g)
-        mesh = _mesh_of(model, g, hull=collides)
-        if mesh is None:
+        drawn = _mesh_of(model, g)
+        if drawn is None:
             continue
+        meshed = collides and int(model.geom_type[g]) == mujoco.mjtGeom.mjGEOM_MESH
+        mesh = trimesh.convex.convex_hull(drawn) if meshed else drawn
         rotation, position = quaternion_matrix(model.geom_quat[g]), model.geom_pos[g]
         vertices = np.asarray(mesh.vertices) @ rotation.T + position
         visual = not collides or body not in visual_bodies
-        shapes.append(LinkGeometry(link_of_body[body], vertices, np.asarray(mesh.faces), collides, visual))
+        shapes.append(LinkGeometry(link_of_body[body], vertices, np.asarray(mesh.faces), collides, visual, _fill(drawn, mesh)))
     return tuple(shapes)
 
 
@@ -207,17 +208,20 @@ def _collides(model: mujoco.MjModel, g: int) -> bool:
     return bool(model.geom_contype[g] or model.geom_conaffinity[g])
 
 
-def _mesh_of(model: mujoco.MjModel, g: int, hull: bool) -> trimesh.Trimesh | None:
-    """The geom as triangles in its own frame; None for planes and height fields."""
-    import trimesh
+def _fill(mesh: trimesh.Trimesh, hull: trimesh.Trimesh) -> float:
+    """Share of its hull's volume that a mesh fills, up to 1; 1 of an open one, which has none."""
+    inside, whole = (abs(enclosed_volume(each.vertices[each.faces])) for each in (mesh, hull))
+    return inside / whole if inside < whole and mesh.is_watertight else 1.0
 
+
+def _mesh_of(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
+    """The geom as triangles in its own frame; None for planes and height fields."""
     kind, size = int(model.geom_type[g]), model.geom_size[g]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         i = int(model.geom_dataid[g])
         vertices = model.mesh_vert[model.mesh_vertadr[i] :][: model.mesh_vertnum[i]]
         faces = model.mesh_face[model.mesh_faceadr[i] :][: model.mesh_facenum[i]]
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        return trimesh.convex.convex_hull(mesh) if hull else mesh
+        return trimesh.Trimesh(vertices, faces, process=False)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
