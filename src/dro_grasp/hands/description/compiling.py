@@ -162,7 +162,8 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
 
 def _convert(mesh: mujoco.MjsMesh, notes: list[Note]) -> bool:
     """Give a mesh, in place, the vertices and faces that trimesh reads from its file; False if there are none."""
-    if not (file := Path(mesh.file)).is_file() or not len((found := read_mesh(file, notes)).faces):
+    found = read_mesh(file, notes) if (file := Path(mesh.file)).is_file() else None
+    if not isinstance(found, trimesh.Trimesh) or not len(found.faces):
         return False
     mesh.file, mesh.uservert, mesh.userface = "", np.asarray(found.vertices).ravel(), np.asarray(found.faces).ravel()
     return True
@@ -255,7 +256,7 @@ def in_lines(notes: Iterable[Note]) -> list[str]:
     return [f"{level}: {', '.join(subjects)}: {text}" for (level, text), subjects in alike.items()]
 
 
-def read_mesh(file: Path, notes: list[Note]) -> trimesh.Trimesh:
+def read_mesh(file: Path, notes: list[Note]) -> trimesh.Geometry:
     """A mesh in any format trimesh reads, in metres; another unit that the file states is noted."""
     # trimesh alone is called here, and its many readers raise whatever they stumble over.
     with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
