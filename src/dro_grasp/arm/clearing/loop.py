@@ -112,7 +112,11 @@ class Rig(Protocol):
         ...
 
     def move(self, arm: Trajectory, hand: Trajectory) -> None:
-        """Follow trajectories of arm and hand with the same times, and come back when they have ended."""
+        """Follow trajectories of arm and hand with the same times, and come back when they have ended.
+
+        Joints are the description's [rad or m], here and in `joints`, whatever `zeros`, `signs` and `units` the robot file
+        states: `robot.drivers` takes both, arm before hand, to drivers' numbers and back.
+        """
         ...
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
