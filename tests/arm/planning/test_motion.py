@@ -16,6 +16,8 @@ import yaml
 
 import dro_grasp as dro
 from dro_grasp.arm.planning.motion import STAGES, MotionPlan, Trajectory
+from dro_grasp.arm.planning.task_stages import task_yaml
+from dro_grasp.arm.planning.workcell import Workcell
 from dro_grasp.errors import PlanError
 
 
@@ -84,6 +86,19 @@ def test_fast_loops_get_no_jumps_of_velocity(planned: MotionPlan, rate: float, r
 def test_a_rate_that_gives_no_points_is_refused(planned: MotionPlan, rate: float) -> None:
     with pytest.raises(dro.DroGraspError, match="give how many points a second has"):
         planned.points(rate)
+
+
+def test_names_break_no_file(planned: MotionPlan, robot: dro.Robot) -> None:
+    strange = replace(planned, notes=replace(planned.notes, object="my\nmug: [", robot="a\n- b"))
+    assert yaml.load(dro.trajectory_yaml(strange), yaml.CSafeLoader)["arm"]["points"]
+    assert yaml.load(task_yaml(strange, robot), yaml.CSafeLoader)["stages"]
+
+
+def test_a_way_beyond_the_limits_of_joints_is_not_free(robot: dro.Robot) -> None:
+    cell, q = Workcell(robot), robot.home.copy()
+    assert cell.free(q, robot.open_hand)
+    q[0] = robot.upper[0] + 1e-3
+    assert not cell.free(q, robot.open_hand)
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.grasps.columns import HOLD_COLUMNS, WEIGHT_COLUMN
-from dro_grasp.grasps.export.writers import yaml_text
+from dro_grasp.grasps.export.writers import on_one_line, yaml_text
 from dro_grasp.grasps.forces import forces_in_words
 from dro_grasp.grasps.hold import HoldCheck, HoldExpectation, check_hold
 
@@ -357,7 +357,8 @@ def trajectory_yaml(plan: MotionPlan, efforts: bool = False) -> str:
                               "position": _plain(joints), "effort": _plain(forces)}
     units = "rad or m" if notes.scales is None else "the drivers' numbers (zeros, signs and units of the robot file)"
     does = "pushes" if notes.slide is not None else "lifts" if notes.place is None else "lifts and places"
-    return (f"# Robot '{notes.robot}' {does} object '{notes.object}'. Joints in {units}, efforts in Nm or N, time in s.\n"
+    title = on_one_line(f"Robot '{notes.robot}' {does} object '{notes.object}'.")
+    return (f"# {title} Joints in {units}, efforts in Nm or N, time in s.\n"
             + (f"# The grasp {told}.\n" if told else "")
             + (f"# The object should weigh {hold.weight:.3g} N.\n" if hold is not None and hold.weight is not None else "")
             + f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dro_grasp.arm.planning.motion import DIGITS, MotionPlan
 from dro_grasp.arm.planning.workcell import wxyz
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.grasps.export.writers import yaml_text
+from dro_grasp.grasps.export.writers import on_one_line, yaml_text
 
 ARM = "arm"  # Name of the group of the arm's joints
 HAND = "hand"  # And of those of the hand
@@ -54,8 +54,10 @@ def task_stages(plan: MotionPlan, robot: Robot) -> list[dict[str, Any]]:
 def task_yaml(plan: MotionPlan, robot: Robot) -> str:
     """The stages of a plan as YAML."""
     does = "push" if plan.notes.slide is not None else "lift" if plan.notes.place is None else "lift and place"
-    return (f"# Stages of a task: {does} '{plan.notes.object}' with robot '{robot.name}'. Types are those of MoveIt Task "
-            "Constructor.\n# Metres, radians, Nm or N; quaternions WXYZ; joints as the robot's description counts them.\n"
+    title = on_one_line(f"Stages of a task: {does} '{plan.notes.object}' with robot '{robot.name}'.")
+    return (f"# {title} Types are those of MoveIt Task Constructor.\n"
+            "# Metres, radians, Nm or N; quaternions WXYZ; joints as the robot's description counts them.\n"
+            "# Allow object and hand to touch what the object stands on: its name in your scene is not known here.\n"
             + yaml_text({"groups": {ARM: list(robot.arm_joints), HAND: list(robot.hand_joints)},
                          "stages": task_stages(plan, robot)}))
 

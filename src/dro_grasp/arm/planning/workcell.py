@@ -32,6 +32,7 @@ TABLE = "table"  # Name of the table
 TARGET = "target"  # Name of the object that is grasped
 OBSTACLE = "obstacle"  # What obstacles are called in contacts
 VOXEL = 0.01  # Edge of the cells that a cloud of obstacles fills [m] (ours)
+BEYOND = 1e-4  # How far a joint may be beyond its limit [rad or m] (ours): drivers round more
 CLEARANCE = 0.005  # Distance that the robot keeps from everything else while it travels [m] (ours)
 SINK = 0.002
 """How much deeper than at the start a carried object may be in what it stood on or against [m]; clouds are not exact (ours)."""
@@ -172,8 +173,9 @@ class Workcell:
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = CLEARANCE,
         moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False, kept: float | None = None, aimed: bool = False,
     ) -> bool:
-        """Whether nothing collides; arguments as for `contacts`."""
-        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept, aimed).any()
+        """Whether nothing collides, within the limits of the arm's joints; arguments as for `contacts`."""
+        lower, upper = self.robot.lower - BEYOND, self.robot.upper + BEYOND
+        return bool(((arm >= lower) & (arm <= upper)).all()) and not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept, aimed).any()
 
     def beside(self, moved: Float[np.ndarray, "4 4"] | None = None) -> list[tuple[float, str]]:
         """Signed distances of the object, here or moved, to table and obstacles near it, with their names [m]."""

@@ -114,11 +114,16 @@ def states_forces(grasps: GraspBatch) -> bool:
     return any(bool(column.isfinite().any()) for column in (grasps.payload, grasps.squeeze_force, grasps.squeeze_torque))
 
 
+def on_one_line(text: str) -> str:
+    """Text for a comment, in which names stand as they were given: without line breaks and other control characters."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
 def comment(grasps: GraspBatch, frame: Frame) -> str:
     """Three lines that a reader of the file needs: hand, frame, units and the meaning of numbers."""
-    named = f"Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {frame.sentence(grasps)}."
+    named = on_one_line(f"Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {frame.sentence(grasps)}.")
     return (
-        f"# {''.join(c if c.isprintable() else ' ' for c in named)}\n"
+        f"# {named}\n"
         "# Metres and radians; quaternions by name or WXYZ. Joints are the independent ones; mimic joints follow them.\n"
         "# Score: predicted log-odds that the grasp holds; confidence is its logistic function. Energy: lower is better."
         f"{f' {FORCES}' if states_forces(grasps) else ''}\n"
