@@ -175,7 +175,9 @@ class Workcell:
     ) -> bool:
         """Whether nothing collides, within the limits of the arm's joints; arguments as for `contacts`."""
         lower, upper = self.robot.lower - BEYOND, self.robot.upper + BEYOND
-        return bool(((arm >= lower) & (arm <= upper)).all()) and not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept, aimed).any()
+        if not ((arm >= lower) & (arm <= upper)).all():
+            return False
+        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch, kept, aimed).any()
 
     def beside(self, moved: Float[np.ndarray, "4 4"] | None = None) -> list[tuple[float, str]]:
         """Signed distances of the object, here or moved, to table and obstacles near it, with their names [m]."""
