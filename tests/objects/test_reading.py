@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import DroGraspError, ObjectError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import cloud_object, estimate_normals, load_file
-from dro_grasp.objects.reading import read_rows
+from dro_grasp.objects.reading import read_cloud, read_rows
 from dro_grasp.objects.shape import CLOUD_POINTS
 
 
@@ -338,6 +338,13 @@ def test_damaged_compressed_pcd_is_refused(tmp_path: Path, damage: str) -> None:
     (tmp_path / "c.pcd").write_bytes(whole)
     with pytest.raises(ObjectError, match="it is damaged"):
         load_file(tmp_path / "c.pcd")
+
+
+def test_an_organised_pcd_keeps_its_rows_and_columns(tmp_path: Path) -> None:
+    whole = pcd(0.04 * directions(300), "binary").replace(b"WIDTH 300\nHEIGHT 1\n", b"WIDTH 20\nHEIGHT 15\n")
+    (tmp_path / "c.pcd").write_bytes(whole)
+    assert read_cloud(tmp_path / "c.pcd").shape == (15, 20, 3)
+    assert len(load_file(tmp_path / "c.pcd").cloud) == 300
 
 
 def test_a_pcd_header_without_points_states_rows_and_columns(tmp_path: Path) -> None:

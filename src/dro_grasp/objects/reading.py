@@ -187,8 +187,8 @@ def _check_npy(path: Path) -> None:
         raise ValueError(f"its header claims {claimed} bytes")
 
 
-def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
-    """Points, and normals if there are any. A field may take several columns (COUNT)."""
+def _read_pcd(path: Path) -> Float[np.ndarray, "... columns"]:
+    """Points, and normals if there are any, in rows and columns if they are an image's. A field may take several (COUNT)."""
     raw = path.read_bytes()
     header, start = _pcd_header(raw, path)
     fields, kind = header["FIELDS"], header["DATA"][0]
@@ -213,7 +213,8 @@ def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
         raise ObjectError(f"{path} holds {kind} data; save the cloud as ascii, binary or binary_compressed PCD")
     if len(table) != count:
         raise ObjectError(f"{path} is truncated: its header promises {count} points, it holds {len(table)}")
-    return table
+    height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))
+    return table.reshape(height, width, -1) if height > 1 and height * width == count else table
 
 
 def _ascii_rows(text: bytes, columns: list[int], count: int) -> Float[np.ndarray, "n columns"]:

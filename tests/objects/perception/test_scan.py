@@ -23,6 +23,7 @@ from dro_grasp.grasps.sources import object_of, with_sources
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import visible_points
 from dro_grasp.objects.perception.scan import check_depths, depth_points, load_scan, ordinary, scanned_object
+from dro_grasp.objects.perception.scene_files import SceneCamera, sight_of_cloud
 from dro_grasp.objects.shape import ObjectModel
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
@@ -172,6 +173,22 @@ def test_intrinsics_of_a_part_of_an_image_are_taken(depth: np.ndarray) -> None:
     whole = depth_points(depth, INTRINSICS)
     near = KDTree(whole).query(depth_points(part, matrix))[0]
     assert near.max() < 1e-9
+
+
+def test_the_matrix_of_an_image_before_it_was_turned_is_refused() -> None:
+    upright, matrix = np.full((640, 480), 0.6), np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    with pytest.raises(ObjectError, match="of the image before it was turned"):
+        depth_points(upright, matrix)
+    assert len(depth_points(upright, np.array([[600.0, 0, 240], [0, 600, 320], [0, 0, 1]]))) == upright.size
+
+
+def test_points_behind_the_camera_are_refused(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    """As OpenGL has them: z points backward."""
+    points = depth_points(depth, INTRINSICS) * [1, -1, -1]
+    with pytest.raises(ObjectError, match="100 % of its points behind the camera, whose z points forward"):
+        scanned_object("mug", points, T_object_camera)
+    with pytest.raises(ObjectError, match="behind the camera"):
+        sight_of_cloud(points, SceneCamera(T_object_camera), None)
 
 
 def test_a_scan_drops_and_counts_pixels_without_a_return(

@@ -34,6 +34,7 @@ SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
 """Width over height of cameras' images [1] (ours)."""
 RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 """Widths of other images that a camera's matrix may be of, over that of the given one [1] (ours)."""
+BEHIND = 0.05  # Share of points behind the camera from which on a cloud is not in its frame [1] (ours): few are noise
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
 DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
@@ -103,8 +104,12 @@ def check_intrinsics(matrix: Shaped[np.ndarray, "..."], height: int, width: int)
 
 def _check_resolution(matrix: Float[np.ndarray, "3 3"], height: int, width: int, given: str, expected: str) -> None:
     # A part of an image has its principal point anywhere, and rarely the sides of a whole one.
-    if not any(abs(width / height / sides - 1) < 0.01 for sides in SIDES):
+    if not any(abs(max(width, height) / min(width, height) / sides - 1) < 0.01 for sides in SIDES):
         return
+    if width != height and all(
+            abs(2 * (float(c) + 0.5) / side - 1) < 0.08 for c, side in zip(matrix[:2, 2], (height, width), strict=True)):
+        raise ObjectError(f"{given}, which is of the image before it was turned: turn the matrix too, or give the image as the "
+                          f"camera took it; {expected}")
     across, down = (2 * (float(c) + 0.5) / side for c, side in zip(matrix[:2, 2], (width, height), strict=True))
     other = any(abs(across / factor - 1) < 0.08 for factor in RESOLUTIONS)
     if other and down > 0 and any(abs(across / down / sides - 1) < 0.08 for sides in (1.0, 4 / 3, 3 / 4)):
@@ -261,11 +266,20 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
     check_view(rows[:, :3], name)
     if not keep_table:
         refuse_scene(whole, rows[:, :3], name)
+    refuse_behind(whole, f"{name} has")
     middle = rows[:, :3].mean(0)
     if float((rows[:, :3] @ middle).min()) <= LEAST_DEPTH * float(middle @ middle):
         raise ObjectError(f"{name} has points behind or beside the camera, which is at the cloud's origin; give the cloud in "
                           "the camera's frame")
     return Cleaned(rows, table, cut, total, told)
+
+
+def refuse_behind(points: Float[np.ndarray, "n 3"], has: str) -> None:
+    """Refuse points of a camera, in its frame [m], of which many are behind it, by an ObjectError."""
+    if len(points) and (share := float((points[:, 2] <= 0).mean())) > BEHIND:
+        raise ObjectError(f"{has} {100 * share:.0f} % of its points behind the camera, whose z points forward; give them in "
+                          "the camera's frame as OpenCV and ROS's optical frames have it (x right, y down), or leave out the "
+                          "camera")
 
 
 def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n columns"]:

@@ -16,7 +16,7 @@ from dro_grasp.files import given_path, reading
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
 from dro_grasp.objects.perception.choosing import Sight
-from dro_grasp.objects.perception.scan import NEAREST, check_depths, check_intrinsics
+from dro_grasp.objects.perception.scan import NEAREST, check_depths, check_intrinsics, refuse_behind
 from dro_grasp.objects.reading import IMAGES, is_image, numbers, read_cloud, returned
 
 WHOLE_UNIT = 0.001  # Unit of depths that are whole numbers [m]. Source: REP 118, ROS
@@ -141,5 +141,7 @@ def sight_of_cloud(points: Float[np.ndarray, "n 3"], camera: SceneCamera | None,
     if len(kept) and camera is not None and (away := float(np.median(np.linalg.norm(points[kept], axis=1)))) < NEAREST:
         raise ObjectError(f"the points of the cloud are {away:.3g} m from the camera, nearer than a depth camera measures "
                           f"({NEAREST:g} m); give them in metres, in the frame of the camera")
+    if camera is not None:
+        refuse_behind(points[kept], "the cloud has")
     T = np.eye(4) if camera is None else camera.T_frame_camera
     return Sight(points[kept], T, camera is not None, kept, shape, None if camera is None else camera.intrinsics)
