@@ -175,8 +175,7 @@ def attempt(
             result = replace(result, stage="see")
             begin, processor = time.perf_counter(), time.process_time()
             seen, T = _see(scene, config, int(draw.integers(2**31)))
-            see_seconds = time.perf_counter() - begin
-            result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
+            result, begin = replace(result, stage="plan", see_seconds=time.perf_counter() - begin), time.perf_counter()
             grasps = None if proposer is None else proposer(seen, T, own + number)
             place = draw_place(scene, seen, config.region, np.random.default_rng([own, number, 2])) if config.place else None
             if grasps is None and config.slide and may_slide(seen.robot, seen.obj, T):
