@@ -29,7 +29,7 @@ from dro_grasp.training.data.engine import labels
 from dro_grasp.training.data.engine.labels import RESTLESS
 from dro_grasp.training.data.engine.schedule import require_settings
 from dro_grasp.training.data.engine.shards import Shard, find_shards
-from dro_grasp.training.data.engine.worker import EngineConfig, Job
+from dro_grasp.training.data.engine.worker import LOOSE, EngineConfig, Job
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.one_object import valid_grasps
 
@@ -163,6 +163,23 @@ def test_settled_labels_state_a_squeeze_and_hold_again(stored):
             number += len(passed)
         held.append(number)
     assert 0 < held[0] <= held[1]
+
+
+def test_a_label_is_held_by_two_links(stored, monkeypatch):
+    honest = filtering.simulate
+
+    def caged(*arguments, **options):
+        trial = honest(*arguments, **options)
+        trial.contacts[:] = 1
+        return trial
+
+    (pair,) = [pair for pair in read_collection(stored, only_successful=False) if pair.object == "can"]
+    config, hand, can = FilterConfig((changed("carry"),), resettle=True), loaded_hand("barrett"), load_object("can")
+    usual, before, _ = passing(hand, can, pair.grasps, config)
+    monkeypatch.setattr(filtering, "simulate", caged)
+    kept, failures, _ = passing(hand, can, pair.grasps, config)
+    assert len(kept) == before[LOOSE] == 0
+    assert failures[LOOSE] >= len(usual) > 0
 
 
 def test_what_comes_to_rest_in_one_place_stays_once(stored):

@@ -26,6 +26,7 @@ from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import refine
+from dro_grasp.simulation.outcome import FEWEST_LINKS
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.data.collections.collection import PairGrasps, Sources, sound_sources, yield_notes
@@ -34,7 +35,7 @@ from dro_grasp.training.data.engine.labels import RESTLESS, also_passing, at_res
 from dro_grasp.training.data.engine.pools import LocalPool, attempt
 from dro_grasp.training.data.engine.schedule import COMMAND, REPORT_EVERY, SETTINGS, agree
 from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_shards, notes_of, remove_leftovers, sole_run
-from dro_grasp.training.data.engine.worker import FinishedShard
+from dro_grasp.training.data.engine.worker import LOOSE, FinishedShard
 
 FILTER = "filter"  # Entry of a file's notes, and value of the setting COMMAND
 ROW = "row"  # Further column, while a pair is filtered: which row of it a grasp was
@@ -135,6 +136,9 @@ def _passing(
         evaluated, = closed_where_they_hold(hand, [obj], [evaluated], first)
     failures.update(f.value for f, held in zip(trial.failure, evaluated.success.tolist(), strict=True) if f and not held)
     held = evaluated.success
+    if config.resettle:  # labels are what `synthesize` makes: a cage of one link is none
+        loose = held & (trial.contacts < FEWEST_LINKS)
+        held, failures = held & ~loose, failures + Counter({LOOSE: int(loose.sum())})
     marked = evaluated[held]
     marked = marked.replace(extra=marked.extra | {ROW: rows[held]})
     (passed, later), = also_passing(hand, [obj], [marked], further)

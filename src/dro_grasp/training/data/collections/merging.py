@@ -136,7 +136,7 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
 
 
 def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None, file_bytes: int) -> Iterator[Merged]:
-    hand, row_bytes, number = None, 0.0, 1
+    hand, row_bytes, most, number = None, 0.0, 0, 1
     kept: list[pa.Table] = []
     header: dict[str, Any] = {}
     yields, duplicates, surplus = {}, 0, 0
@@ -153,7 +153,8 @@ def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None
         kept.append(pa.table(columns))
         yields[obj] = sum((waiting.made for waiting in group), Yield())
         duplicates, surplus = duplicates + len(grasps) - len(new), surplus + len(new) - len(chosen)
-        row_bytes = row_bytes or len(table_bytes(columns, header)) / max(1, len(chosen))
+        if len(chosen) > most:  # in small ones, the header counts for each grasp
+            row_bytes, most = len(table_bytes(columns, header)) / len(chosen), len(chosen)
         if row_bytes * sum(table.num_rows for table in kept) >= file_bytes:
             yield Merged(name, _joined(kept), header, yields, duplicates, surplus, number)
             kept, yields, duplicates, surplus, number = [], {}, 0, 0, number + 1
