@@ -172,6 +172,7 @@ def test_the_whole_recipe_survives_a_kill_in_each_step(tmp_path: Path) -> None:
     subprocess.run(["sha256sum", "--check", CHECKSUMS], cwd=shipped, check=True, capture_output=True)
     stages = [entry["stage"] for entry in history_of(shipped / "more_objects.safetensors")]
     assert stages == ["pretraining", "training", "placement"]
+    assert history_of(shipped / "more_objects.safetensors")[0]["motion_steps"] == 4
     for name in pack.SET:
         about = history_of(shipped / f"{name}.safetensors")[-1]
         assert about["samples"] > 0

@@ -109,7 +109,8 @@ class Pretrain(Stage):
         took = how_long(self.run_folder)
         if network.placed:
             settings["motion"] = motion
-            took["seconds"] += how_long(self.run_folder / "motion")["seconds"]
+            further = how_long(self.run_folder / "motion")
+            took |= {"motion_steps": further["steps"], "seconds": took["seconds"] + further["seconds"]}
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
         about = took | {
