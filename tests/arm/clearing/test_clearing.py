@@ -269,7 +269,7 @@ def test_a_bin_holds_what_is_above_it_and_has_four_walls() -> None:
 
 
 @pytest.mark.parametrize(("wrong", "told"), [
-    (lambda: Bin(size=(0.0, 0.3)), "the bin has size"), (lambda: Bin(height=-1.0), "walls of -1.0 m"),
+    (lambda: Bin(size=(0.0, 0.3)), r"size \(0.0, 0.3\)"), (lambda: Bin(height=-1.0), "walls of -1.0 m"),
     (lambda: ClearConfig(tries=0), "tries is 0; give at least 1"),
 ])
 def test_what_is_no_bin_and_no_number_is_refused(wrong: Any, told: str) -> None:
