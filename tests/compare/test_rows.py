@@ -165,6 +165,7 @@ def test_the_average_of_hands_with_one_number_has_the_interval_of_all() -> None:
     assert alone.success[STRICT] == pytest.approx((3 / 8, *wilson_interval(3, 8)))
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("name", ["carry", "dexgraspbench", "dro"])
 def test_every_force_counts_where_each_starts_anew(name: str) -> None:
     grasps = GraspBatch.create(HAND, CAN, torch.eye(4).repeat(3, 1, 1), HAND.canonical_joints().repeat(3, 1))

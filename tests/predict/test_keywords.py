@@ -30,6 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Constraints]:
     return asked
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("nothing", [(), [], np.zeros((0, 4)), torch.zeros(0, 4)])
 def test_keywords_replace_constraints_with_nothing_as_well(asked: list[Constraints], nothing: Any) -> None:
     own = Constraints(contact_region=((0.0, 0.0, 0.0, 0.5),), margin=1.0)
@@ -39,6 +40,7 @@ def test_keywords_replace_constraints_with_nothing_as_well(asked: list[Constrain
     assert asked == [own, own, Constraints(margin=1.0)]
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize("make", [np.array, torch.tensor, list])
 def test_constraints_are_given_as_any_kind_of_rows(asked: list[Constraints], make: Callable[[Any], Any]) -> None:
     direction, region = make([0.0, 0.0, -1.0]), make([[0.0, 0.0, 0.0, 0.5]])

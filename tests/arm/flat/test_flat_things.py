@@ -132,9 +132,9 @@ def test_what_is_seen_flat(narrow: Robot, tmp_path: Path) -> None:
     assert np.allclose(found.obj.centre_of_mass[:2], (0.5, 0.1), atol=0.002)
     assert np.allclose(found.others[0].cloud[:, :2].mean(0), (0.43, -0.12), atol=0.01)
     assert seen_flat("can", points, of_can, table, EYE) is None
-    T = np.eye(4)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])  # it looks down
     T[:3, 3] = EYE
-    scene = load_scene((points - EYE)[None], camera=SceneCamera(T, None, "world"))
+    scene = load_scene(((points - EYE) @ T[:3, :3])[None], camera=SceneCamera(T, None, "world"))
     picked = dro.pick_object(scene, narrow, mask=of_card[None], name="card")
     assert np.allclose(picked.obj.centre_of_mass, found.obj.centre_of_mass, atol=1e-4)
     assert picked.robot.table is not None

@@ -34,7 +34,7 @@ SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
 """Width over height of cameras' images [1] (ours)."""
 RESOLUTIONS = (1 / 4, 1 / 3, 1 / 2, 3 / 2, 2.0, 3.0, 4.0)
 """Widths of other images that a camera's matrix may be of, over that of the given one [1] (ours)."""
-BEHIND = 0.05  # Share of points behind the camera from which on a cloud is not in its frame [1] (ours): few are noise
+BEHIND = 0.9  # Share of points behind the camera from which on a cloud is not in its frame [1] (ours)
 DEPTH_UNITS = {"centimetres": 1e-2, "millimetres": 1e-3, "tenths of a millimetre": 1e-4, "micrometres": 1e-6}
 """Units of depth images [m], the largest first."""
 DEPTHS = (0.2, 10.0)  # Least and largest median depth of a camera's image of things to grasp, or of a room [m] (ours)
@@ -275,7 +275,7 @@ def _cleaned(rows: Float[np.ndarray, "n columns"], name: str, denoise: bool, kee
 
 
 def refuse_behind(points: Float[np.ndarray, "n 3"], has: str) -> None:
-    """Refuse points of a camera, in its frame [m], of which many are behind it, by an ObjectError."""
+    """Refuse points of a camera, in its frame [m], of which nearly all are behind it, by an ObjectError."""
     if len(points) and (share := float((points[:, 2] <= 0).mean())) > BEHIND:
         raise ObjectError(f"{has} {100 * share:.0f} % of its points behind the camera, whose z points forward; give them in "
                           "the camera's frame as OpenCV and ROS's optical frames have it (x right, y down), or leave out the "
