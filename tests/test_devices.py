@@ -18,6 +18,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
@@ -140,3 +141,10 @@ def test_no_more_is_waited_for_than_the_cpu_s_own(device: str) -> None:
 def test_a_device_that_nothing_runs_on_is_refused(name: str) -> None:
     with pytest.raises(OptionError, match=f"device is '{name}'; give cpu, cuda, cuda:1 or mps"):
         require_device(name)
+
+
+def test_what_is_on_its_device_already_keeps_what_it_has_derived() -> None:
+    obj = load_object("sphere")
+    assert on_device(obj.distance_field, "cpu") is obj.distance_field
+    assert on_device(obj.distance_field, "meta") is not obj.distance_field
+    assert GraspProblem(toy_hand(), obj).energy().field is obj.distance_field

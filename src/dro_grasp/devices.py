@@ -203,10 +203,13 @@ def quick_path_is_accurate() -> bool:
 
 
 def on_device(record: Record, device: torch.device | str) -> Record:
-    """Copy a frozen dataclass to a device: its tensors, and its records that have a `to`."""
+    """A frozen dataclass on a device, with its tensors and its records that have a `to`; itself, if all of it is there.
+
+    So what a record has derived of itself is not derived again.
+    """
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
-    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
-    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+    moved = {name: new for name, value in values.items() if hasattr(value, "to") and (new := value.to(device)) is not value}
+    return dataclasses.replace(record, **moved) if moved else record  # type: ignore[type-var]
 
 
 class Rows:
