@@ -12,7 +12,7 @@ import torch
 from dro_grasp.devices import at_once, choose_device, cores, may_hold, on_device, require_device, side_by_side, where_any
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimize.grasp_energy import link_spheres
+from dro_grasp.optimize.grasp_energy import EnergyConfig, link_spheres
 from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
@@ -147,4 +147,4 @@ def test_what_is_on_its_device_already_keeps_what_it_has_derived() -> None:
     obj = load_object("sphere")
     assert on_device(obj.distance_field, "cpu") is obj.distance_field
     assert on_device(obj.distance_field, "meta") is not obj.distance_field
-    assert GraspProblem(toy_hand(), obj).energy().field is obj.distance_field
+    assert GraspProblem(toy_hand(), obj).energy(EnergyConfig()).field is obj.distance_field
