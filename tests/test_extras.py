@@ -58,3 +58,13 @@ def test_a_command_without_its_extra_says_what_to_install(
     said = capsys.readouterr().err
     assert f"not installed: {missing}; run pip install 'dro-grasp[{extra}]'" in said
     assert said.count("\n") == 1
+
+
+def test_timing_loads_no_library_of_drawings_until_it_is_used() -> None:
+    code = ("import sys, numpy as np; from dro_grasp.arm.planning.trajectory import smooth;"
+            "smooth(np.eye(2), *np.ones((2, 2)));"
+            "assert not any(name.startswith('matplotlib') for name in sys.modules);"
+            "from toppra.algorithm import algorithm; figure = algorithm.plt.figure;"
+            "import matplotlib.pyplot; assert matplotlib.pyplot.figure is figure")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 
 from dro_grasp.errors import OptionError
 
@@ -23,3 +28,23 @@ def require_extra(name: str) -> None:
     if missing := [package for package in EXTRAS[name] if find_spec(package) is None]:
         raise OptionError(f"this needs packages that are not installed: {', '.join(missing)}; run "
                           f"pip install 'dro-grasp[{name}]', or pip install '.[{name}]' in the folder of the clone")
+
+
+@contextmanager
+def later(package: str, module: str) -> Iterator[None]:
+    """While another library is imported, let it find a package and a module of it that load themselves when first used."""
+    names = package, f"{package}.{module}"
+    if any(name in sys.modules for name in names):
+        yield
+        return
+    stands: list[ModuleType] = [ModuleType(name) for name in names]
+    for name, stand in zip(names, stands, strict=True):
+        stand.__dict__["__getattr__"] = lambda attribute, name=name: getattr(import_module(name), attribute)
+        sys.modules[name] = stand
+    stands[0].__dict__[module] = stands[1]
+    try:
+        yield
+    finally:
+        for name, stand in zip(names, stands, strict=True):
+            if sys.modules.get(name) is stand:
+                del sys.modules[name]

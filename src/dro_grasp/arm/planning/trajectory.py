@@ -19,6 +19,7 @@ from dro_grasp.arm.planning.motion import Trajectory
 from dro_grasp.arm.planning.reachability import Feasible, Postures, Put, carried
 from dro_grasp.arm.planning.workcell import CARRIED, CLEARANCE, Workcell
 from dro_grasp.arm.robots.robot import Robot
+from dro_grasp.extras import later
 
 SPACING = 0.08  # Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)
 STEP = 0.01  # Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances
@@ -251,8 +252,9 @@ def smooth(
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import toppra
-        from toppra import algorithm, constraint
+        with later("matplotlib", "pyplot"):  # with which it can draw
+            import toppra
+            from toppra import algorithm, constraint
 
         logging.getLogger("toppra").setLevel(logging.CRITICAL)
         limits = [constraint.JointVelocityConstraint(USED * np.stack([-velocity, velocity], 1)),
