@@ -15,7 +15,7 @@ try:
     for _ in range(2):
         answer = client.predict("allegro", cloud, num=4, direction=(0, 0, -1))
         x, y, z = answer["grasps"][0]["wrist_position"]
-        print(f"{len(answer['grasps'])} grasps in {answer['seconds']['whole']:.1f} s; the best has its wrist at "
+        print(f"{len(answer['grasps'])} grasps in {answer['seconds']['total']:.1f} s; the best has its wrist at "
               f"({x:.3f}, {y:.3f}, {z:.3f}) m and score {answer['grasps'][0]['score']:.2f}")
 finally:
     server.terminate()

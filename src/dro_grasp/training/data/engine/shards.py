@@ -168,16 +168,19 @@ def sole_run(folder: Path, part: tuple[int, int] = (1, 1), mergeable: bool = Fal
     suffix = "" if part[1] == 1 else f"-{part[0]}-of-{part[1]}"
     lock = FileLock(folder / f"{LOCK}{suffix}", timeout=0, fallback_to_soft=False)
     fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)} - {LOCK + suffix}
+    holder = folder / f"{HOLDER}{suffix}"
     try:
         _take(lock, folder, mergeable)
         with suppress(OSError):  # on a full disk the first shard tells
-            (folder / f"{HOLDER}{suffix}").write_text(f"{os.getpid()} on {socket.gethostname()}")
+            holder.write_text(f"{os.getpid()} on {socket.gethostname()}")
         for other in sorted({path.name for path in folder.glob(f"{LOCK}*")} - fellows - {LOCK + suffix}):
             rival = FileLock(folder / other, timeout=0, fallback_to_soft=False)
             _take(rival, folder, mergeable)
             rival.release()
         yield
     finally:
+        if lock.is_locked:
+            holder.unlink(missing_ok=True)
         lock.release()
 
 
