@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dro_grasp.graphs import Repeated, repeat
+from tests.helpers.capturing_cuda import DEVICE, CapturingCuda, Generator
 from tests.helpers.fake_device import fake_device
 from tests.helpers.recorded_work import record
 
@@ -94,6 +95,80 @@ def test_work_on_the_cpu_is_never_recorded() -> None:
     repeated = Repeated(lambda given: calls.append(1) or given.values, torch.Generator())
     assert [repeated(Given(torch.full((1,), float(n)))).item() for n in range(3)] == [0.0, 1.0, 2.0]
     assert len(calls) == 3
+
+
+def test_after_a_refused_capture_numbers_are_drawn_and_memory_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = CapturingCuda(monkeypatch)
+    generator, drawn = Generator(cuda), list[int]()
+
+    def work(given: Given) -> Tensor:
+        drawn.append(generator.draw())
+        cuda.wait()
+        return given.values
+
+    repeated = Repeated(work, generator)  # type: ignore[arg-type]
+    for _ in range(3):
+        repeated(Given(torch.ones(1, device=DEVICE.type)))
+    assert drawn == [1, 1, 2, 3], "once for the first call, once as it is refused, then as if nothing had been"
+    assert cuda.default.draw() == 1
+    assert not cuda.underway
+    assert not cuda.users.total()
+
+
+def test_work_that_fails_as_it_is_captured_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = CapturingCuda(monkeypatch)
+    generator, drawn = Generator(cuda), list[int]()
+
+    def work(given: Given) -> Tensor:
+        drawn.append(generator.draw())
+        if cuda.capturing:
+            raise torch.OutOfMemoryError
+        return given.values
+
+    repeated = Repeated(work, generator)  # type: ignore[arg-type]
+    for _ in range(2):
+        repeated(Given(torch.ones(1, device=DEVICE.type)))
+    assert drawn == [1, 1, 2]
+    assert not cuda.underway
+    assert not cuda.users.total()
+
+
+def test_repeated_steps_share_their_memory_and_recorded_work_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = CapturingCuda(monkeypatch)
+
+    def step(state: Tensor, number: Tensor) -> Tensor:
+        if len(state) == 3:
+            cuda.wait()
+        return state + number
+
+    for size in (1, 2, 3, 4, 5):  # one of which is refused
+        repeat(step, torch.zeros(size, device=DEVICE.type), 5)
+    assert sorted(cuda.users.values()) == [0, 1], "what a refused one shared is shared no more"
+    repeated = Repeated(lambda given: given.values, Generator(cuda))  # type: ignore[arg-type]
+    repeated(Given(torch.ones(1, device=DEVICE.type)))
+    repeat(step, torch.zeros(6, device=DEVICE.type), 5)
+    assert sorted(cuda.users.values()) == [0, 1, 1]
+    del repeated
+    assert sorted(cuda.users.values()) == [0, 0, 1]
+
+
+@pytest.mark.gpu
+def test_a_gpu_goes_on_after_a_refused_capture() -> None:
+    generator = torch.Generator("cuda")
+
+    def work(given: Given) -> tuple[Tensor, Tensor]:
+        noise = torch.rand(4, generator=generator, device="cuda")
+        return given.values * given.values.sum().item(), noise + 0 * torch.rand(4, device="cuda")
+
+    repeated = Repeated(work, generator)
+    for number in range(3):
+        values = torch.full((4,), float(number), device="cuda")
+        generator.manual_seed(number)
+        found, noise = repeated(Given(values))
+        generator.manual_seed(number)
+        assert torch.equal(noise, torch.rand(4, generator=generator, device="cuda"))
+        assert torch.equal(found, 4 * number * values)
+    torch.cuda.empty_cache()  # refused as long as anything counts as captured
 
 
 @pytest.mark.gpu

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from typing import Any, Generic, TypeVar
 
@@ -55,6 +55,9 @@ class _Graph:
 
 _WARM: set[Any] = set()  # Code of the steps that ran before: libraries set themselves up at first use, which is not captured
 _CAPTURING = threading.Lock()  # What another thread launches on the stream meanwhile would become part of the graph
+_LAST: dict[torch.cuda.Stream, torch.cuda.CUDAGraph] = {}
+"""The last graph of `repeat` on each stream. It is kept, so that the next one takes over its memory: what graphs leave is given
+back to nobody before the GPU is full."""
 
 
 def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) -> _Graph | None:
@@ -72,13 +75,13 @@ def _captured(step: Callable[[State, Int[Tensor, "1"]], State], state: State) ->
             step(kept, number)
             _WARM.add(step.__code__)
 
-    replay = recorded(run, number.device, warm)
+    replay = recorded(run, number.device, warm, once=True)
     return None if replay is None else _Graph(kept, replay)
 
 
 def recorded(
     run: Callable[[], None], device: torch.device, warm: Callable[[], object] = lambda: None,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator | None = None, once: bool = False,
 ) -> Callable[[], None] | None:
     """What repeats the work that CUDA is given by a call, which is not done yet; None if CUDA refuses.
 
@@ -86,25 +89,61 @@ def recorded(
         run: Launches the work.
         warm: Work that is done before on the same stream.
         generator: Source of the work's random numbers, if it has any: each repetition goes on from its state.
+        once: Whether all repetitions come before the next work on the current stream: such works share their memory.
     """
-    stream, graph = _capture_stream(device), torch.cuda.CUDAGraph()
-    if generator is not None:
-        graph.register_generator_state(generator)
-    stream.wait_stream(torch.cuda.current_stream(device))
+    here, stream, graph = torch.cuda.current_stream(device), _capture_stream(device), torch.cuda.CUDAGraph()
+    stream.wait_stream(here)
     try:
         with _CAPTURING, torch.cuda.stream(stream):
             warm()
-            graph.capture_begin(capture_error_mode="thread_local")
-            try:
+            last = _LAST.pop(here, None) if once else None
+            with _capture(graph, torch.cuda.graph_pool_handle() if last is None else last.pool(), stream, generator):
                 run()
-            finally:
-                graph.capture_end()
+            if once:
+                _LAST[here] = graph
     except RuntimeError:
         replay = None
     else:
         replay = graph.replay
-    torch.cuda.current_stream(device).wait_stream(stream)  # in any case for what `warm` did
+    here.wait_stream(stream)  # in any case for what `warm` did
     return replay
+
+
+@contextmanager
+def _capture(
+    graph: torch.cuda.CUDAGraph, pool: Any, stream: torch.cuda.Stream, generator: torch.Generator | None
+) -> Iterator[None]:
+    """Capture what the block launches, in memory of a pool; one that fails leaves generators and memory as they were.
+
+    PyTorch ends what it has begun only once CUDA has accepted a capture. Otherwise generators (in 2.11), always the device's
+    own too, refuse to draw from then on, and the pool's memory (in 2.13 still) is lost.
+    """
+    device = stream.device.index
+    generators = [torch.cuda.default_generators[device], *([] if generator is None else [generator])]
+    states = [one.clone_state() for one in generators]
+    if generator is not None:
+        graph.register_generator_state(generator)
+    try:
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+        try:
+            yield
+        finally:
+            graph.capture_end()
+    except BaseException:
+        for one, state in zip(generators, states, strict=True):
+            one.graphsafe_set_state(state)
+        with suppress(RuntimeError):  # raised where PyTorch has ended it
+            _end_allocation()(device, pool)
+            torch._C._cuda_releasePool(device, pool)
+        with suppress(RuntimeError):  # what CUDA still has to tell of the failure comes with the next launch
+            torch.zeros(1, device=stream.device)
+        raise
+
+
+def _end_allocation() -> Callable[[int, Any], None]:
+    """PyTorch's end of allocating in a pool, by its name until 2.7 or since then."""
+    names = ("_cuda_endAllocateToPool", "_cuda_endAllocateCurrentStreamToPool")
+    return next(getattr(torch._C, name) for name in names if hasattr(torch._C, name))
 
 
 @cache

@@ -70,7 +70,7 @@ def record(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     def recorded(
         run: Callable[[], None], device: torch.device, warm: Callable[[], object] = lambda: None,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | None = None, once: bool = False,
     ) -> Callable[[], None] | None:
         warm()
         state = None if generator is None else generator.get_state()
