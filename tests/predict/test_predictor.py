@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp import devices
+from dro_grasp import devices, extras
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -353,6 +353,23 @@ def test_a_source_that_proposes_nothing_is_told(weights: str, ball: ObjectModel)
         with pytest.raises(NoGraspError, match="only 0 of 0 candidates"):
             GraspPredictor(weights, config=PredictorConfig(finish=config)).predict(
                 HAND, ball, num=2, source=Listed(some(ball, 1)[:0]))
+
+
+def test_many_grasps_on_a_device_without_the_extra_for_trials_are_refused_before_the_work(
+    weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    hand, predictor = loaded_hand("gripper3"), GraspPredictor(weights)
+    problem, source = GraspProblem(hand, ball), Listed(GraspBatch.none(hand, ball))
+    predictor.device = "cuda"
+    with pytest.raises(NoGraspError):  # so few would close on the processor
+        predictor.run(problem, GraspRequest(16, source=source))
+    for problems, request in (([problem] * 4, GraspRequest(16, source=source)), ([problem], GraspRequest(64, source=source))):
+        asked = len(source.asked_for)
+        with pytest.raises(OptionError, match=r"warp, mujoco_warp.*dro-grasp\[gpu\]"):
+            predictor.run_many(problems, request)
+        assert len(source.asked_for) == asked
+        predictor.run_many(problems, dataclasses.replace(request, refine=False))  # nothing closes
 
 
 def test_a_source_that_does_not_know_the_hand_is_not_asked(weights: str, ball: ObjectModel) -> None:

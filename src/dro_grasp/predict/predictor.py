@@ -36,6 +36,8 @@ from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.sources.source import Asked, Candidates, Progress, Source, ask, ask_all
 from dro_grasp.predict.sources.variation import VariationSource
 from dro_grasp.predict.stages import complete, grouped
+from dro_grasp.simulation.rollout import FEW
+from dro_grasp.simulation.worlds import require_worlds
 
 PARTS = ("network", "choose", "decode", "optimiser", "refine", "settle", "rank", "weigh", "ease")
 """Parts of a prediction whose seconds are always told."""
@@ -210,8 +212,10 @@ class GraspPredictor:
             For each problem what `run` returns, or the error of one without any grasp.
 
         Raises:
-            OptionError: There is no such source, or it does not know the hand.
+            OptionError: There is no such source, it does not know the hand, or so many grasps settle on a device and the extra
+                for that is missing.
         """
+        self._require_worlds(problems, request)
         under_way = [_Asking(self, problem, request) for problem in problems]
         rounds = {asking: asking.rounds(*self._roles(asking.problem, request)) for asking in under_way}
         while rounds:
@@ -261,6 +265,12 @@ class GraspPredictor:
             config = self.config.network
             return NetworkSource(self.network, config if temperature is None else replace(config, temperature=temperature))
         return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
+
+    def _require_worlds(self, problems: Sequence[GraspProblem], request: GraspRequest) -> None:
+        """Refuse at once what would settle on a device without the extra for that: so many candidates together."""
+        settle = self.config.finish.settle if request.refine and all(map(can_settle, problems)) else None
+        if settle is not None and len(problems) * request.num * min(settle.spare, request.candidates) >= FEW:
+            require_worlds(self.device)
 
     def _roles(self, problem: GraspProblem, request: GraspRequest) -> tuple[Source | None, Source | None]:
         """The source that is asked first, and the one that makes rivals for what is not trusted."""

@@ -10,6 +10,7 @@ import mujoco.batch
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dro_grasp.extras import require_extra
 from dro_grasp.simulation.scene import TrialScene
 
 STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a simulation needs to continue from an earlier moment
@@ -80,6 +81,12 @@ def worlds(shares: Sequence[Share], workers: int, device: str) -> Worlds:
 def on_processor(device: str) -> bool:
     """Whether simulations that belong to a device run on the processor: wherever Warp has no part to play."""
     return device != WARP and not device.startswith("cuda")
+
+
+def require_worlds(device: str) -> None:
+    """Refuse a device on which nothing can be simulated, as the extra is missing, by an OptionError."""
+    if not on_processor(device):
+        require_extra("gpu")
 
 
 class ProcessorWorlds:

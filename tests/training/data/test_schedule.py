@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.errors import ObjectError, OptionError, OutputError
 from dro_grasp.grasps import grasp_file
@@ -38,6 +39,17 @@ def test_every_pair_gets_its_first_shard_before_any_gets_its_second(tmp_path):
     assert report.grasps == report.added == 18 * GRASPS
     assert report.shards == 18
     assert not report.failures
+
+
+def test_a_device_without_the_extra_for_trials_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "require_device", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    config = EngineConfig(synthesis=SynthesisConfig(device="cuda:1"))
+    with pytest.raises(OptionError, match=r"warp, mujoco_warp.*dro-grasp\[gpu\]"):
+        synthesize_dataset(["gripper3"], ["can"], 1, tmp_path / "new", 1, 0, config)
+    assert not (tmp_path / "new").exists()
 
 
 def test_hands_take_turns_so_that_a_run_that_ends_early_has_grasps_of_all(tmp_path):

@@ -27,6 +27,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import checked, flat
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
+from dro_grasp.simulation.worlds import require_worlds
 from dro_grasp.training.data.engine.pools import LocalPool, Outcome, Pool
 from dro_grasp.training.data.engine.shards import Failed, Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.training.data.engine.worker import EngineConfig, FinishedShard, Job, Task
@@ -110,8 +111,8 @@ def synthesize_dataset(
         progress: Called with a line of text now and then; None prints to stderr.
 
     Raises:
-        OptionError: A number is not positive, the time is not finite, this machine lacks the device, or the folder was begun
-            with other settings (see `require_settings`).
+        OptionError: A number is not positive, the time is not finite, this machine lacks the device or the extra that simulates
+            there, or the folder was begun with other settings (see `require_settings`).
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
     config = config or EngineConfig()
@@ -121,6 +122,7 @@ def synthesize_dataset(
         raise OptionError(f"seconds is {config.seconds}; give a positive number, or None for no limit")
     if isinstance(workers, int):
         require_device(config.synthesis.device)
+        require_worlds(config.synthesis.device)
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
     with sole_run(folder, config.shard, mergeable=True):
