@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.errors import BundleError, OptionError, OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
@@ -258,6 +259,34 @@ def test_what_is_refused_leaves_no_folder(
 def test_fields_out_of_range_are_refused(more: dict[str, float], word: str) -> None:
     with pytest.raises(OptionError, match=word):
         OnboardingConfig(**more)
+
+
+def test_a_device_without_the_extra_for_trials_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onboarding, "require_device", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    with pytest.raises(OptionError, match=r"warp, mujoco_warp.*dro-grasp\[gpu\]"):
+        OnboardingConfig(device="cuda")
+
+
+def test_shards_on_a_device_are_as_large_as_those_of_synthesize(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[EngineConfig]()
+
+    def synthesized(*given: object) -> None:
+        asked.extend(one for one in given if isinstance(one, EngineConfig))
+        raise InterruptedError
+
+    monkeypatch.setattr(onboarding, "require_device", lambda device: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: object())
+    monkeypatch.setattr(onboarding, "synthesize_dataset", synthesized)
+    for device in ("cpu", "cuda"):
+        begun = onboarding._Onboarding("gripper3", tmp_path, small(home, device=device), ["can"], [], str)
+        with pytest.raises(InterruptedError):
+            begun._data()
+    assert [one.synthesis.device for one in asked] == ["cpu", "cuda"]
+    assert asked[0].candidates == 32
+    assert asked[1] == asked[1].suited() != asked[0].suited()
 
 
 def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

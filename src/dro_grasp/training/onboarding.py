@@ -36,6 +36,7 @@ from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.provenance import made_by
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS, protocol
+from dro_grasp.simulation.worlds import require_worlds
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import load_bundle, split_of
 from dro_grasp.training.data.collections.bundling import make_bundle
@@ -88,6 +89,7 @@ class OnboardingConfig(Checked):
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example minutes=30")
         require_device(self.device)
+        require_worlds(self.device)
         require_seed(self.seed, 31)
         for name, option in (("num", " (num=...)"), ("workers", " (workers=...)"), ("most_grasps", ""), ("grasps_drawn", "")):
             if (value := getattr(self, name)) < 1:
@@ -280,7 +282,7 @@ class _Onboarding:
     def _data(self) -> dict[str, Any]:
         config = self.config
         engine = replace(config.engine, seconds=60 * config.minutes * config.data_share,
-                         synthesis=replace(config.engine.synthesis, device=config.device))
+                         synthesis=replace(config.engine.synthesis, device=config.device)).suited()
         report = synthesize_dataset([self.name], self.objects, config.most_grasps, self.folder / DATA, config.workers,
                                     config.seed, engine, self.say)
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
