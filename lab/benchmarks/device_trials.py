@@ -1,8 +1,9 @@
 """Trials on a device beside the processor's: how many verdicts agree, how many run in a second, and what settling takes.
 
 Agreement is of stored grasps, which hold under `strict`: the same number of each hand, all those of its first training objects
-until the number is full. Speed is of the network's refined candidates of one hand and object, repeated, without the processor's
-confirmation. Settling is that of the same candidates, by part.
+until the number is full. The device runs them all, also those of an object with few. Speed is of the network's refined
+candidates of one hand and object, repeated, without the processor's confirmation. Settling is that of the same candidates, by
+part.
 
     python -m lab.benchmarks.device_trials [--device cuda] [--grasps FILE ...] [--num N] [--protocols NAME ...]
         [--worlds N ...] [--settled N] [--hand HAND] [--object NAME] [--pack FOLDER] [--record FILE] [--json]
@@ -23,6 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Bool, Int
@@ -38,10 +40,11 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.network import NetworkSource, ProposalConfig
 from dro_grasp.predict.sources.source import ask
-from dro_grasp.simulation import grasp_state, trial
+from dro_grasp.simulation import grasp_state, rollout as rollout_module, trial
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
 from dro_grasp.simulation.trial import TrialResult, simulate
+from dro_grasp.simulation.worlds import require_worlds
 from lab.benchmarks.agreement import kappa
 from lab.benchmarks.report import emit, note, options_of, rate
 from lab.measurements import STORED
@@ -73,6 +76,11 @@ def pack(paths: Sequence[Path], num: int, folder: Path) -> None:
     (folder / "objects" / "manifest.json").write_text(json.dumps(entries))
 
 
+ON_THE_DEVICE = patch.object(rollout_module, "FEW", 0)
+"""Lets the device run few grasps too, which the processor would do sooner: it would be compared with itself."""
+
+
+@ON_THE_DEVICE
 def agreement(path: Path, protocol: str, options: argparse.Namespace) -> list[list[object]]:
     """A line for a file of grasps; what disagrees is printed."""
     grasps, results = GraspBatch.load(path), []
@@ -116,6 +124,7 @@ def candidates(problem: GraspProblem, num: int) -> GraspBatch:
     return stages.complete(problem, stages.refine(problem, made.grasps, FinishConfig().refine))
 
 
+@ON_THE_DEVICE
 def speed(grasps: GraspBatch, worlds: int, options: argparse.Namespace) -> list[list[object]]:
     """Closings and whole strict trials a second, warm, and how many verdicts are those of the processor."""
     hand, obj = load_hand(options.hand), load_object(options.object)
@@ -209,6 +218,7 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if options.pack:
         return pack(options.grasps, options.num, options.pack)
+    require_worlds(options.device)
     lines = [line for path in options.grasps for name in options.protocols for line in agreement(path, name, options)]
     device = "cpu" if options.device == "warp" else options.device
     if options.worlds or options.settled:

@@ -2,7 +2,7 @@
 
 What is measured is appended to a file at once, so a run that is cut off keeps its rows, and the next one measures what is
 missing. Rows of other code, other weights or another card are measured anew. The parts follow each other, each in a process of
-its own, the agreement of verdicts last. A row that nobody measured is blank.
+its own, the agreement of verdicts last. A row that nobody measured is blank; it is named, and the exit code is 1.
 
     python -m lab.benchmarks.gpu_table [--device cuda] [--minutes 8] [--record out/gpu.jsonl] [--show] [--json]
 
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from dro_grasp.devices import require_device
-from dro_grasp.simulation.worlds import WARP
+from dro_grasp.simulation.worlds import WARP, require_worlds
 from lab.benchmarks.device import MANY, ONE, SHARES, SINGLE
 from lab.benchmarks.report import emit, machine, note, options_of
 from lab.measurements import STORED
@@ -156,8 +156,13 @@ def lines(found: dict[str, Found]) -> list[list[object]]:
     return told
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Measure what is missing, and print all that there is."""
+def missing(found: dict[str, Found], device: str) -> list[str]:
+    """Names that nothing was noted under, or too little."""
+    return [name for names, _ in parts(device) for name in names if not whole(found.get(name))]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure what is missing, and print all that there is; 1 if anything still is."""
     parser = options_of(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--minutes", type=float, default=8.0, help="no part goes on after this time [min]")
@@ -166,11 +171,15 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if not options.show:
         require_device("cpu" if options.device in SMALL else options.device)
+        require_worlds(options.device)
         measure(options)
     found = noted(options.record, options.device)
     emit(f"On {options.device}; blank: not measured", lines(found), ["what", "measured", "unit", "goal", "reached", "of"],
          {"rows": found}, options.json)
+    if lacking := missing(found, options.device):
+        print(f"not measured: {'; '.join(lacking)}", file=sys.stderr)
+    return int(bool(lacking))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -15,6 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
+from dro_grasp import extras
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.network.presets import PRESETS
@@ -26,6 +27,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources import source as sources
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Asked, Candidates, Source
+from dro_grasp.simulation import warp_worlds
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.data.bundle.training_file import write_bundle
 from dro_grasp.training.data.collections.filtering import FILTER
@@ -46,7 +48,9 @@ from lab.benchmarks.report import ROOT, note
 from lab.measurements import STORED
 from lab.studies import paper_form
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.steady_grasps import steady_grasps
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
+from tests.helpers.warp_steps import State, Steps
 
 
 def test_the_gain_by_pretraining_is_scipys_paired_interval() -> None:
@@ -235,6 +239,23 @@ def test_stored_grasps_of_each_hand_are_as_many_as_the_table_wants(path: Path) -
     assert [grasps.object[row] for row in rows.tolist()] == [name for name, own in found for _ in own]
 
 
+def test_verdicts_of_few_grasps_of_an_object_are_the_device_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo in Warp's place says that they explode."""
+    pytest.importorskip("mujoco_warp")
+
+    def explode(state: State, missed: np.ndarray) -> None:
+        state["qpos"][:] = np.nan
+
+    steps, path = Steps(explode), tmp_path / "grasps.parquet"
+    monkeypatch.setattr(warp_worlds, "_graphs", steps)
+    stored = steady_grasps()[0]
+    stored.replace(split=("train",) * len(stored)).save(path)
+    options = SimpleNamespace(num=3, device="cuda", record=tmp_path / "rows.jsonl")
+    ((_, grasps, held, other, *_),) = device_trials.agreement(path, "strict", options)
+    assert steps.calls
+    assert (grasps, held[:4], other[:3]) == (3, "66.7", "0.0")
+
+
 @pytest.mark.assets
 def test_what_agreement_needs_of_the_assets_goes_to_another_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, assets_folder: Path
@@ -272,13 +293,15 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
 
     monkeypatch.setattr(gpu_table, "subprocess", SimpleNamespace(run=run, **{
         name: getattr(subprocess, name) for name in ("DEVNULL", "TimeoutExpired")}))
-    monkeypatch.setattr(gpu_table, "require_device", lambda name: None)
+    monkeypatch.setattr(gpu_table, "require_device", lambda device: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: object())
     monkeypatch.setattr(gpu_table, "state", lambda: "this code")
-    gpu_table.main(["--record", str(record)])
+    assert gpu_table.main(["--record", str(record)]) == 1
     names = [name for names, _ in gpu_table.parts("cuda") for name in names]
     assert sorted(names) == sorted({row.name for row in gpu_table.ROWS})
     assert len(begun) == len(gpu_table.parts("cuda"))
-    shown = capsys.readouterr().out
+    shown, told = capsys.readouterr()
+    assert told.splitlines()[-1] == f"not measured: {'; '.join(['whole strict trials', *names[5:]])}"
     table = gpu_table.lines(gpu_table.noted(record, "cuda"))
     assert [(row[1], row[4]) for row in table[:5]] == [
         (600.0, "yes"), (600.0, "yes"), (151.0, "no"), (4999.0, "no"), ("blank", "")]
@@ -299,6 +322,17 @@ def test_a_gpu_s_table_has_a_part_for_every_row_and_is_blank_where_nothing_was_n
     assert gpu_table.noted(record, "cuda")
     gpu_table.main(["--record", str(record), "--minutes", "1"])
     assert len(begun) == len(gpu_table.parts("cuda"))
+
+
+def test_a_whole_table_of_a_gpu_lacks_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(gpu_table, "state", lambda: "this code")
+    for names, _ in gpu_table.parts("cuda"):
+        for name in names:
+            note(tmp_path / "rows.jsonl", name, device="cuda", rate=1.0, milliseconds=1.0, judging=0.1, same=1, grasps=1)
+    assert gpu_table.main(["--record", str(tmp_path / "rows.jsonl"), "--show"]) == 0
+    assert not capsys.readouterr().err
 
 
 def test_rows_of_a_gpu_are_of_code_weights_and_card(monkeypatch: pytest.MonkeyPatch) -> None:
