@@ -5,7 +5,8 @@
 Each measurement has one file in lab/results: its commands, what they printed, and of which state. A command whose result is
 there, of the same command, code and weights, is not run again; interrupting loses what runs at the moment. Code counts by its
 syntax without docstrings and comments, so that a better sentence makes nothing stale. With uncommitted changes to what is
-measured nothing runs.
+measured nothing runs. On a copy without git, as on a machine with a GPU, the commit is `unknown` and that hash alone says of
+which code a result is: carry its file back to lab/results.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def measure(job: Job, beside: bool) -> dict[str, Any]:
     done = subprocess.run(words(job.command), cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     where = {key: value for key, value in machine().items() if key != "commit"}
     return {
-        "command": job.command, "commit": commit(), **job.state, "machine": where,
+        "command": job.command, "commit": commit() or "unknown", **job.state, "machine": where,
         "date": day.strftime("%Y-%m-%d"), "load": round(load, 1), "seconds": round(time.perf_counter() - begin, 1),
         "inputs": {name: file_hash(ROOT / PREPARED / name) for name in PREPARATIONS if f"{PREPARED}/{name}" in job.command
                    and (ROOT / PREPARED / name).is_file()},
@@ -222,7 +223,7 @@ def code_hash(part: str) -> str:
     path, digest = ROOT / part, hashlib.sha256()
     for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
         digest.update(str(file.relative_to(ROOT)).encode())
-        digest.update(ast.dump(without_docstrings(ast.parse(file.read_text()))).encode())
+        digest.update(told(without_docstrings(ast.parse(file.read_text()))).encode())
     return digest.hexdigest()[:12]
 
 
@@ -233,6 +234,18 @@ def without_docstrings(tree: ast.Module) -> ast.Module:
         if isinstance(body, list):
             node.body = [line for line in body if not is_text(line)]  # type: ignore[attr-defined]
     return tree
+
+
+def told(syntax: object) -> str:
+    """A syntax tree in words that are the same in each version of Python: some have more fields, and texts in texts, all empty."""
+    if isinstance(syntax, list):
+        return f"[{', '.join(map(told, syntax))}]"
+    if isinstance(syntax, ast.JoinedStr):
+        syntax = ast.JoinedStr([part for part in syntax.values if told(part) != told(ast.Constant(""))])
+    if isinstance(syntax, ast.AST):
+        fields = (f"{name}={told(value)}" for name, value in ast.iter_fields(syntax) if value not in (None, []))
+        return f"{type(syntax).__name__}({', '.join(fields)})"
+    return ascii(syntax)
 
 
 def is_text(line: ast.stmt) -> bool:
@@ -257,7 +270,9 @@ def git(*arguments: str) -> str:
 
 
 def uncommitted() -> list[str]:
-    """Files of code, data and weights that differ from the commit."""
+    """Files of code, data and weights that differ from the commit, if there is one."""
+    if not commit():
+        return []
     lines = git("status", "--porcelain", "--", "src", "lab", "data").splitlines()
     return [line[3:] for line in lines if not line[3:].startswith(("lab/results", "lab/notebook"))]
 

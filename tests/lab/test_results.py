@@ -40,12 +40,13 @@ def test_every_table_that_can_be_written_is_somewhere_and_none_is_twice() -> Non
     assert len(tabled) == len(set(tabled))
 
 
-def test_results_are_of_commands_that_are_declared_and_of_a_commit() -> None:
+def test_results_are_of_commands_that_are_declared_and_of_known_code() -> None:
     for path in runner.RESULTS.glob("*.json"):
         cells = json.loads(path.read_text())["cells"]
         assert set(cells) <= set(MEASUREMENTS[path.stem].cells), path.name
         for cell in cells.values():
-            assert re.fullmatch(r"[0-9a-f]{10}", cell["commit"]), path.name
+            assert re.fullmatch(r"[0-9a-f]{10}|unknown", cell["commit"]), path.name
+            assert cell["code"], path.name
             assert {"command", "code", "weights", "machine", "date", "load", "seconds", "result"} <= set(cell)
 
 
@@ -199,6 +200,45 @@ def test_code_counts_by_its_syntax_without_docstrings(tmp_path: Path, monkeypatc
         hashes.append(runner.code_hash("m.py"))
     runner.code_hash.cache_clear()
     assert hashes[0] == hashes[1] != hashes[2]
+
+
+PROBE = '''
+@once
+class A(B, c=1):
+    x: dict[str, float] = {**y, "\u00e9\U0001fae9": None}
+    async def f(self, a, /, b=2.5, *c, d=..., **e) -> None:
+        with open(a) as g, h:
+            return f"{a!r:>{b}} {c=}" f"z" if a[1:] else lambda: (yield)
+    def g(): pass
+match x:
+    case {"a": [1, *_]} | None: del x
+try:
+    x = [k async for k in y if (z := k)]
+except* E as e:
+    raise e from None
+'''
+
+
+def test_the_hash_of_code_is_the_same_in_each_version_of_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "ROOT", tmp_path)
+    (tmp_path / "probe.py").write_text(PROBE)
+    runner.code_hash.cache_clear()
+    assert runner.code_hash("probe.py") == "660bc4a6ca35"  # by Python 3.11, 3.12 and 3.13
+    runner.code_hash.cache_clear()
+
+
+def test_results_of_a_copy_without_git_say_by_its_hash_of_which_code_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "MEASUREMENTS", {"quick": Measurement("A number", {"one": "python -c 'print(1)'"}, ())})
+    monkeypatch.setattr(runner, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(runner, "commit", lambda: "")
+    monkeypatch.setattr(runner, "git", lambda *arguments: pytest.fail("there is no git"))
+    assert runner.main([]) == 0
+    cell = runner.read("quick")["cells"]["one"]
+    assert cell["commit"] == "unknown"
+    assert cell["code"]["src/dro_grasp/simulation"] == runner.code_hash("src/dro_grasp/simulation")
+    assert runner.main(["--stale"]) == 0
 
 
 def test_changes_of_code_count_as_uncommitted_and_results_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
