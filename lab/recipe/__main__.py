@@ -32,6 +32,8 @@ from lab.runner import words
 
 RECORD = "recipe.json"
 """File in the folder with what was run."""
+FEEDING = 2
+"""Most processes that feed a device; each takes its share of the cores for what stays on the processor. As docs/data.md says."""
 PR_SET_PDEATHSIG = 1
 """Of Linux's prctl: the signal that a process gets when its parent dies."""
 
@@ -43,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", default="out", help="where everything is made")
     parser.add_argument("--tiny", action="store_true", help="rehearse in minutes")
     parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes on the processor")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help=f"processes on the processor, or threads of the {FEEDING} processes that feed a device")
     parser.add_argument("--minutes", type=float, help="time limit of `data`, divided among its steps; run again to go on")
     parser.add_argument("--list", action="store_true", help="only print the commands")
     options = parser.parse_args(argv)
@@ -76,7 +78,9 @@ class Attempt:
     ) -> None:
         """`changed` takes what code made that no commit holds."""
         self.step, self.record, self.changed = step, ROOT / folder / RECORD, changed
-        self.workers, self.device, self.minutes = workers, device, minutes
+        feeds = device != "cpu" and "{device}" in step.free
+        self.workers, self.threads = (min(workers, FEEDING), workers) if feeds else (workers, 1)
+        self.device, self.minutes = device, minutes
         self.command = step.command.replace("{folder}", folder)
         self.read = fingerprint(ROOT / path for path in step.reads) if all((ROOT / p).exists() for p in step.reads) else ""
         digits = sha256(f"{self.command} {self.read}".encode()).hexdigest()[:8]
@@ -113,7 +117,7 @@ class Attempt:
         print(f"{self.step.name}: {self.told()}", flush=True)
         if self.step.makes:
             (ROOT / self.step.makes).parent.mkdir(parents=True, exist_ok=True)
-        environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": str(self.threads)}
         begin = time.monotonic()
         code = subprocess.run(self.words(), cwd=ROOT, env=environment, preexec_fn=end_with_parent).returncode
         if code == 0:

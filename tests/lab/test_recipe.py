@@ -57,6 +57,20 @@ def test_a_step_is_run_once_and_again_for_another_command_or_other_files(tmp_pat
     assert json.loads((tmp_path / recipe.RECORD).read_text())["one"]["read"] == fingerprint([source])
 
 
+@pytest.mark.parametrize(("device", "free", "workers", "threads"), [
+    ("cpu", "--workers {workers} --device {device}", "8", "1"), ("cuda", "--workers {workers} --device {device}", "2", "8"),
+    ("cuda:1", "--workers {workers} --device {device}", "2", "8"), ("cuda", "--workers {workers}", "8", "1")])
+def test_few_processes_with_all_cores_feed_a_device(
+    tmp_path: Path, device: str, free: str, workers: str, threads: str
+) -> None:
+    script = tmp_path / "step.py"
+    script.write_text(f"import os, pathlib, sys\npathlib.Path({str(tmp_path / 'seen')!r}).write_text("
+                      "os.environ['OMP_NUM_THREADS'] + ' ' + ' '.join(sys.argv[1:]))\n")
+    assert Attempt(Step("one", f"python {script}", free=free), str(tmp_path), 8, device, None, True).run() == 0
+    seen = (tmp_path / "seen").read_text().split()
+    assert (seen[0], seen[2]) == (threads, workers)
+
+
 def test_a_step_that_fails_ends_the_run_with_its_code_and_is_not_done(tmp_path: Path) -> None:
     step = attempt(tmp_path, "python -c 'raise SystemExit(3)'", tmp_path / "made")
     assert step.run() == 3
