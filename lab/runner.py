@@ -237,7 +237,7 @@ def without_docstrings(tree: ast.Module) -> ast.Module:
 
 
 def told(syntax: object) -> str:
-    """A syntax tree in words that are the same in each version of Python: some have more fields, and texts in texts, all empty."""
+    """A syntax tree in words that are the same in each version of Python: more fields or texts of some are empty."""
     if isinstance(syntax, list):
         return f"[{', '.join(map(told, syntax))}]"
     if isinstance(syntax, ast.JoinedStr):

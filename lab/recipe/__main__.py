@@ -33,7 +33,7 @@ from lab.runner import words
 RECORD = "recipe.json"
 """File in the folder with what was run."""
 FEEDING = 2
-"""Most processes that feed a device; each takes its share of the cores for what stays on the processor. As docs/data.md says."""
+"""Most processes that feed a device; each takes its share of the cores for what stays on the processor (docs/data.md)."""
 PR_SET_PDEATHSIG = 1
 """Of Linux's prctl: the signal that a process gets when its parent dies."""
 
@@ -45,7 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", default="out", help="where everything is made")
     parser.add_argument("--tiny", action="store_true", help="rehearse in minutes")
     parser.add_argument("--device", default="auto", help="cpu, cuda, or auto")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help=f"processes on the processor, or threads of the {FEEDING} processes that feed a device")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1,
+                        help=f"processes on the processor; with a device, threads of the {FEEDING} processes that feed it")
     parser.add_argument("--minutes", type=float, help="time limit of `data`, divided among its steps; run again to go on")
     parser.add_argument("--list", action="store_true", help="only print the commands")
     options = parser.parse_args(argv)
