@@ -41,6 +41,7 @@ from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import Squeeze, press
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import hand_shift, simulate
+from dro_grasp.training.data.engine.labels import CHEAP
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.one_object import settle, settle_best, settle_grasps
 
@@ -69,6 +70,17 @@ def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
     T = grasps.T_object_wrist.clone()
     T[:, 2, 3] += torch.tensor(distances)
     return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
+
+
+def test_labels_settle_as_all_else_without_payloads(many: GraspBatch) -> None:
+    fast, whole = (settle_grasps(PROBLEM, many, replace(FIRM, weight=CHEAP.weight, payloads=asked))
+                   for asked in (CHEAP.payloads, True))
+    assert fast.stable.any()
+    assert fast.grasps.payload.isnan().all()
+    assert not whole.grasps.payload[whole.stable].isnan().any()
+    assert fast.stable.equal(whole.stable)
+    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "squeeze_torque", "squeeze_force"):
+        assert getattr(fast.grasps, name).nan_to_num(-1).equal(getattr(whole.grasps, name).nan_to_num(-1)), name
 
 
 def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: GraspBatch, outcome: Settled) -> None:

@@ -88,6 +88,8 @@ class SettleConfig(Checked):
     """Time of each pull on what lies flat on a table [s], as in a trial: pinches turn slowly."""
     weight: WeightConfig = field(default_factory=WeightConfig)
     """How hard settled grasps press for the object's weight."""
+    payloads: bool = True
+    """Whether payloads of settled grasps are predicted, which takes time."""
     lift: LiftConfig = field(default_factory=LiftConfig)
     """Which squeezes are tried on what lies flat on a table."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
@@ -282,7 +284,7 @@ def _closed_again(
     done = pressed_many(hand, solids, near, rules, config=asked, device=device)
     again = [problem.on_table(done.grasps[part]) for problem, part in zip(problems, parts, strict=True)]
     state, squeeze = grasp_state_many(hand, solids, again, rules, config=asked, device=device)
-    payload = done.payloads(~gives_way(state), asked.payload)
+    payload = done.payloads(~gives_way(state) & config.payloads, asked.payload)
     return [
         _judged(problem, grasps, own, shift, found.replace(payload=payload[part]), state.rows(part), squeeze.rows(part), config)
         for problem, grasps, own, shift, found, part in zip(problems, whole, rows, moved, again, parts, strict=True)]

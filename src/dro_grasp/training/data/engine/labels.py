@@ -24,8 +24,8 @@ from dro_grasp.simulation.trial import simulate_many
 
 RESTLESS = "does not come to rest"
 """Reason that counts grasps which still move the object when the hand closes a second time, and therefore get no trial."""
-CHEAP = SettleConfig(weight=WeightConfig(pull=0))
-"""Settling as `generate` does it, without the pulls: they only inform a score (ours)."""
+CHEAP = SettleConfig(weight=WeightConfig(pull=0), payloads=False)
+"""Settling as `generate` does it, without pulls and payloads: they only inform a score and those who ask (ours)."""
 SETTLED = "settled"
 """What the provenance of a grasp says, after its first entry, when it was settled again."""
 
