@@ -9,7 +9,7 @@ import secrets
 import shlex
 import struct
 import zlib
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path
@@ -205,3 +205,24 @@ def replacing(path: Path | str, what: str = "") -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def locking(lock: Path, refuse: Callable[[], str]) -> Iterator[None]:
+    """Hold a lock while the block lasts, where the file system has locks.
+
+    While another process holds it, there is an OutputError with the message that `refuse` returns.
+    """
+    from filelock import FileLock, Timeout  # takes longer to import than all else here
+
+    own = FileLock(lock, timeout=0, fallback_to_soft=False)
+    try:
+        own.acquire()
+    except Timeout as error:
+        raise OutputError(refuse()) from error
+    except OSError:
+        pass  # a file system without locks
+    try:
+        yield
+    finally:
+        own.release()

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from filelock import FileLock, Timeout
 
 from dro_grasp.arm.planning.motion import PLACING
-from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.files import reading, replacing
+from dro_grasp.errors import GraspFileError
+from dro_grasp.files import locking, reading, replacing
 
 
 @dataclass(frozen=True)
@@ -90,24 +89,10 @@ def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
         pq.write_table(pa.Table.from_pylist([asdict(a) for a in attempts]), temporary)
 
 
-@contextmanager
-def sole_writer(path: Path) -> Iterator[None]:
-    """Keep a second run from writing the same file while the block lasts: it would drop what this one stores.
-
-    Raises:
-        OutputError: Another run is writing it.
-    """
-    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=0, fallback_to_soft=False)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise OutputError(f"another run is storing its attempts in {path}; wait for it, or give another file") from error
-    except OSError:
-        pass  # a file system without locks
-    try:
-        yield
-    finally:
-        lock.release()
+def sole_writer(path: Path) -> AbstractContextManager[None]:
+    """Keep a second run out of the file while the block lasts, by an OutputError: it would drop what this one stores."""
+    return locking(path.with_name(f".{path.name}.lock"), lambda: (
+        f"another run is storing its attempts in {path}; wait for it, or give another file"))
 
 
 def read_attempts(path: Path) -> list[Attempt]:

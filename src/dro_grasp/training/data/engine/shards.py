@@ -12,17 +12,15 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
-from filelock import FileLock, Timeout
-
 from dro_grasp._version import __version__
 from dro_grasp.errors import DroGraspError, GraspFileError, OutputError
-from dro_grasp.files import make_folder, replacing
+from dro_grasp.files import locking, make_folder, replacing
 from dro_grasp.grasps.grasp_file import read_footer
 
 LOCK = ".lock"
@@ -166,38 +164,30 @@ def sole_run(folder: Path, part: tuple[int, int] = (1, 1), mergeable: bool = Fal
     OutputError: one is at work; of `mergeable` results it says how they join those of another folder.
     """
     suffix = "" if part[1] == 1 else f"-{part[0]}-of-{part[1]}"
-    lock = FileLock(folder / f"{LOCK}{suffix}", timeout=0, fallback_to_soft=False)
-    fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)} - {LOCK + suffix}
+    fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)}
     holder = folder / f"{HOLDER}{suffix}"
-    try:
-        _take(lock, folder, mergeable)
-        with suppress(OSError):  # on a full disk the first shard tells
-            holder.write_text(f"{os.getpid()} on {socket.gethostname()}")
-        for other in sorted({path.name for path in folder.glob(f"{LOCK}*")} - fellows - {LOCK + suffix}):
-            rival = FileLock(folder / other, timeout=0, fallback_to_soft=False)
-            _take(rival, folder, mergeable)
-            rival.release()
-        yield
-    finally:
-        if lock.is_locked:
+    with _part_locked(folder, LOCK + suffix, mergeable):
+        try:
+            with suppress(OSError):  # on a full disk the first shard tells
+                holder.write_text(f"{os.getpid()} on {socket.gethostname()}")
+            for other in sorted({path.name for path in folder.glob(f"{LOCK}*")} - fellows - {LOCK + suffix}):
+                with _part_locked(folder, other, mergeable):
+                    pass
+            yield
+        finally:
             holder.unlink(missing_ok=True)
-        lock.release()
 
 
-def _take(lock: FileLock, folder: Path, mergeable: bool) -> None:
-    """Acquire a lock where the file system has locks, unless another run holds it."""
-    try:
-        lock.acquire()
-    except Timeout as error:
-        name = Path(lock.lock_file).name
+def _part_locked(folder: Path, name: str, mergeable: bool) -> AbstractContextManager[None]:
+    """Hold the lock of a part of a folder, unless another run does."""
+    def refuse() -> str:
         holder = folder / name.replace(LOCK, HOLDER)
         process = holder.read_text() if holder.exists() else "unknown"
         part = f" as part {name.removeprefix(LOCK + '-').replace('-of-', ' of ')}" if name != LOCK else ""
         join = " and join both with `dro-grasp dataset merge`" if mergeable else ""
-        raise OutputError(f"another run is filling {folder}{part} (process {process}); wait for it, or give another "
-                          f"folder{join}") from error
-    except OSError:
-        pass  # a file system without locks
+        return f"another run is filling {folder}{part} (process {process}); wait for it, or give another folder{join}"
+
+    return locking(folder / name, refuse)
 
 
 def remove_leftovers(folder: Path) -> int:
