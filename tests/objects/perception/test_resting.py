@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dro_grasp.objects.perception.resting import set_down
+from dro_grasp.objects.perception.completion import set_down
 
 RADIUS = 0.035
 TABLE = np.array([0.0, 0.0, 2.0, 0.2])  # at z = 0.1; the normal's length does not count

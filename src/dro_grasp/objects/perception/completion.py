@@ -23,7 +23,6 @@ from scipy.spatial import KDTree
 
 from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.network.completion_network import UNIT, SurfaceFeatures, SurfaceNetwork, load_surface
-from dro_grasp.objects.perception.resting import set_down
 from dro_grasp.objects.surface_distances import cloud_distances
 
 SAMPLE = 300  # Visible points that judge a symmetry (ours)
@@ -36,6 +35,8 @@ STRAY = 0.02  # Share of points that may lie below the end of the visible side, 
 RIM_RADIUS = 0.12  # With a camera: radius of the neighbourhood that tells rim points [widths] (ours)
 TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
+RESTS = 0.002  # What ends no higher above the plane stands on it [m] (ours)
+HOLLOW = 0.35  # What ends higher than this share of its height above it is not known well enough to be made longer (ours)
 
 
 def project(points: Float[np.ndarray, "n 3"], camera_distance: float | None) -> Float[np.ndarray, "n 2"]:
@@ -245,6 +246,27 @@ def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"]) -> CompletedClou
     kept = ~whole.added | (whole.points @ table[:3] > table[3])
     points, normals, added = (column[kept] for column in whole)
     return CompletedCloud(*set_down(points, normals, added, table), added)
+
+
+def set_down(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], added: Bool[np.ndarray, " n"],
+    table: Float[np.ndarray, "4"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points [m] and unit normals with an underside that reaches the plane below: what rests on a plane touches it.
+
+    From above, the underside of a lying thing is not seen, and is completed too high. The added points of the lower half are
+    moved down, in proportion to their depth; what was seen stays where it is.
+    """
+    up = table[:3] / np.linalg.norm(table[:3])
+    height = (points @ table[:3] - table[3]) / np.linalg.norm(table[:3])
+    gap, middle = float(height.min()), float(height.max()) / 2
+    if not RESTS < gap < HOLLOW * 2 * middle:
+        return points, normals
+    low, stretch = added & (height < middle), middle / (middle - gap)
+    down = np.where(low, (stretch - 1) * (middle - height), 0.0)
+    # A surface that is stretched along one axis has normals that shrink along it.
+    turned = normals + np.where(low, (1 / stretch - 1) * (normals @ up), 0.0)[:, None] * up
+    return points - down[:, None] * up, turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def to_view_axes(
