@@ -48,6 +48,13 @@ def checked(call: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     return checking
 
 
+def require_positive(**numbers: int) -> None:
+    """Refuse numbers below 1, by their names: OptionError."""
+    for name, number in numbers.items():
+        if number < 1:
+            raise OptionError(f"{name} is {number}; give at least 1 ({name}=...)")
+
+
 def require_seed(seed: int, bits: int = 63) -> None:
     """Refuse a seed of random numbers that does not fit into so many bits, or is negative: OptionError."""
     if not 0 <= seed < 2**bits:

@@ -112,8 +112,8 @@ def test_settings_that_train_nothing_are_refused(make: Callable[[], object], tol
 
 
 @pytest.mark.parametrize(("command", "options", "told"), [
-    ("pretrain", ["--motion-steps", "0"], "--motion-steps is 0"),
-    ("train", ["--validation-samples", "0"], "--validation-samples is 0"),
+    ("pretrain", ["--motion-steps", "0"], "motion_steps is 0; give at least 1 (--motion-steps)"),
+    ("train", ["--validation-samples", "0"], "validation_samples is 0; give at least 1 (--validation-samples)"),
     ("train", ["--columns", "0"], "(--columns)"), ("train", ["--divergence", "nan"], "divergence is nan"),
     ("train", ["--partial", "5"], "partial is 5.0"),
 ])

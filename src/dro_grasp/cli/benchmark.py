@@ -14,6 +14,7 @@ import tyro
 from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, given_forces, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.kinds import require_positive
 
 if TYPE_CHECKING:
     from dro_grasp.compare.methods import Method
@@ -93,8 +94,7 @@ class Benchmark:
         if not settles and (idle := given_forces(self.margin, self.max_force)):
             raise OptionError(f"{idle} {'say' if ' and ' in idle else 'says'} how hands squeeze once they settle, and in "
                               f"--stages {' '.join(self.stages)} none does; add settled, returned or equal-time")
-        if self.views < 1:
-            raise OptionError(f"--views is {self.views}; give at least 1")
+        require_positive(views=self.views)
         for name in ("hands", "objects", "stages", "protocols"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} is empty; name at least one")

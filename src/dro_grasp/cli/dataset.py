@@ -18,6 +18,7 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside, say_doubts
 from dro_grasp.errors import GraspFileError, HandError, OptionError
 from dro_grasp.files import check_folder, check_output, make_folder
+from dro_grasp.kinds import require_positive
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -96,9 +97,7 @@ class Synthesize:
         return code
 
     def _check_numbers(self) -> None:
-        for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
-            if value < 1:
-                raise OptionError(f"{option} is {value}; give at least 1")
+        require_positive(grasps=self.grasps, workers=self.workers)
         if self.minutes is not None and not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
         if not (math.isfinite(self.scale) and self.scale > 0):

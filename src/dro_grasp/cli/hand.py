@@ -16,6 +16,7 @@ from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say, say_file
 from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.files import check_output, command, make_folder, reading, replacing
+from dro_grasp.kinds import require_positive
 
 if TYPE_CHECKING:
     from dro_grasp.training.made_hands.making import MadeHand
@@ -45,8 +46,7 @@ class Make:
         """Make, write, list and draw."""
         from dro_grasp.training.made_hands.making import hand_name, make_hand
 
-        if self.num < 1:
-            raise OptionError(f"--num is {self.num}; give at least 1")
+        require_positive(num=self.num)
         if self.seed < 0:
             raise OptionError(f"--seed is {self.seed}; give 0 or more")
         if self.picture is not None:

@@ -12,6 +12,7 @@ from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_result, print_table
 from dro_grasp.errors import OptionError
 from dro_grasp.files import check_output
+from dro_grasp.kinds import require_positive
 
 if TYPE_CHECKING:
     from dro_grasp.network.network import DistanceNetwork
@@ -93,7 +94,7 @@ class Pretrain(Stage):
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output, ".safetensors")
-        require_positive("--motion-steps", self.motion_steps)
+        require_positive(motion_steps=self.motion_steps)
         initial = None if self.initial is None else load_weights(self.initial)
         network = self.network(initial)
         schedule = self.schedule(steps=self.steps)
@@ -166,7 +167,7 @@ class Train(Stage):
         from dro_grasp.training.runs import is_first
 
         check_output(self.output, ".safetensors")
-        require_positive("--validation-samples", self.validation_samples)
+        require_positive(validation_samples=self.validation_samples)
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
             raise OptionError("--part placement trains the placement prior of given weights further: name them with --initial, "
                               "and leave out --pretrained")
@@ -227,12 +228,6 @@ class Train(Stage):
         metrics = {"distance_errors": [asdict(error) for error in errors], "validation": validation.fingerprint}
         save_weights(model, self.output, about | {"metrics": metrics}, history)
         return errors
-
-
-def require_positive(option: str, value: int) -> None:
-    """Refuse a number of an option that is not positive: OptionError."""
-    if value < 1:
-        raise OptionError(f"{option} is {value}; give at least 1")
 
 
 def how_long(run_folder: Path) -> dict[str, int]:

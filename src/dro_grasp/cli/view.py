@@ -18,6 +18,7 @@ from dro_grasp.cli.output import say_doubts, say_file
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output
+from dro_grasp.kinds import require_positive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -213,10 +214,10 @@ class Picture:
         """Load the file and draw."""
         from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
-        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet, require_sheet
+        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
 
         require_object(self.scale, self.object)
-        require_sheet(self.count, self.columns)
+        require_positive(count=self.count, columns=self.columns)
         style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
         check_output(self.output, ".png")
         grasps = load_grasps(self.file)

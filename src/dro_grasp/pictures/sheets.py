@@ -24,7 +24,7 @@ from dro_grasp.grasps.batch import GraspBatch, percent
 from dro_grasp.grasps.forces import forces_in_words, known
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked, checked
+from dro_grasp.kinds import Checked, checked, require_positive
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
 from dro_grasp.simulation import trial
@@ -66,13 +66,6 @@ class PictureStyle(Checked):
             raise OptionError(f"opacity is {self.opacity}; give a number from 0 to 1 (opacity=...)")
 
 
-def require_sheet(count: int, columns: int) -> None:
-    """Refuse a sheet of no picture, or of none side by side: OptionError."""
-    for name, number in (("count", count), ("columns", columns)):
-        if number < 1:
-            raise OptionError(f"{name} is {number}; give at least 1 ({name}=...)")
-
-
 Tile = tuple[UInt8[np.ndarray, "height width 3"], str, bool | None]
 """A picture, its caption, and the trial outcome that gives its colour."""
 
@@ -92,7 +85,7 @@ def draw_grasps(
         OutputError: The file cannot be written, or there is no grasp.
     """
     require_pair(hand, obj)
-    require_sheet(count, columns)
+    require_positive(count=count, columns=columns)
     closed = ", drawn after closing" if shows_held(hand, style) else ""
     _save(_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
 
@@ -108,7 +101,7 @@ def draw_sheet(
         OutputError: The file cannot be written, or there is no grasp.
     """
     count = max(1, sum(len(grasps) for _, grasps in pairs))
-    require_sheet(count, columns)
+    require_positive(count=count, columns=columns)
     if len(pairs) == 1:
         (obj, grasps), = pairs
         return draw_grasps(hand, obj, grasps, path, count, columns, style)

@@ -24,7 +24,7 @@ from dro_grasp.files import check_folder, command, make_folder, replacing, set_a
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.kinds import Checked, flat, require_seed
+from dro_grasp.kinds import Checked, flat, require_positive, require_seed
 from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.pictures.sheets import draw_grasps
@@ -91,9 +91,7 @@ class OnboardingConfig(Checked):
         require_device(self.device)
         require_worlds(self.device)
         require_seed(self.seed, 31)
-        for name, option in (("num", " (num=...)"), ("workers", " (workers=...)"), ("most_grasps", ""), ("grasps_drawn", "")):
-            if (value := getattr(self, name)) < 1:
-                raise OptionError(f"{name} is {value}; give at least 1{option}")
+        require_positive(num=self.num, workers=self.workers, most_grasps=self.most_grasps, grasps_drawn=self.grasps_drawn)
         if min(shares := (self.data_share, self.training_share)) <= 0 or sum(shares) > 1:
             raise OptionError(f"data_share and training_share are {shares}; give two positive numbers, at most 1 together")
         source_or_name(self.source)

@@ -26,7 +26,7 @@ from dro_grasp.arm.tabletop.table_scene import PickedObject, pick_object, seen_o
 from dro_grasp.errors import DroGraspError, OptionError, PlanError
 from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.grasps.hold import HoldCheck
-from dro_grasp.kinds import Checked, checked
+from dro_grasp.kinds import Checked, checked, require_positive
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
@@ -98,9 +98,7 @@ class ClearConfig(Checked):
     def __post_init__(self) -> None:
         """Refuse numbers below 1: OptionError."""
         super().__post_init__()
-        for name in ("tries", "most"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} is {getattr(self, name)}; give at least 1")
+        require_positive(tries=self.tries, most=self.most)
 
 
 @runtime_checkable

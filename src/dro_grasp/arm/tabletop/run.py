@@ -24,7 +24,7 @@ from dro_grasp.devices import cores
 from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder
-from dro_grasp.kinds import Checked, checked
+from dro_grasp.kinds import Checked, checked, require_positive
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -98,8 +98,7 @@ def run_tabletop(
         OutputError: `output` or `plans` cannot be written, or another run is storing attempts in `output`.
     """
     require_extra("arm")
-    if workers < 1:
-        raise OptionError(f"workers is {workers}; give at least 1")
+    require_positive(workers=workers)
     output = None if output is None else check_output(output, ".parquet")
     with nullcontext() if output is None else sole_writer(output):
         return _run_tabletop(run, output, workers, progress, plans, make or attempt)

@@ -22,7 +22,7 @@ from dro_grasp.files import is_unread, make_folder, set_aside
 from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.grasps.grasp_file import read_footer
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked, checked
+from dro_grasp.kinds import Checked, checked, require_positive
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import refine
@@ -182,8 +182,7 @@ def filter_dataset(
         ObjectError: An object is a bare cloud.
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
-    if workers < 1:
-        raise OptionError(f"workers is {workers}; give at least 1")
+    require_positive(workers=workers)
     given = list(pairs)
     sound_sources(pair.grasps for pair in given if len(pair.grasps))
     folder = make_folder(output)

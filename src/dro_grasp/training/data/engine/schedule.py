@@ -25,7 +25,7 @@ from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import given_path, is_unread, make_folder, reading, set_aside
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.kinds import checked, flat
+from dro_grasp.kinds import checked, flat, require_positive
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
 from dro_grasp.simulation.worlds import require_worlds
 from dro_grasp.training.data.engine.pools import LocalPool, Outcome, Pool
@@ -116,8 +116,7 @@ def synthesize_dataset(
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
     config = config or EngineConfig()
-    if grasps_per_pair < 1 or (isinstance(workers, int) and workers < 1):
-        raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
+    require_positive(grasps_per_pair=grasps_per_pair, workers=workers if isinstance(workers, int) else 1)
     if config.seconds is not None and not (math.isfinite(config.seconds) and config.seconds > 0):
         raise OptionError(f"seconds is {config.seconds}; give a positive number, or None for no limit")
     if isinstance(workers, int):
