@@ -10,7 +10,7 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.objects.catalogue import load_object, locate_object, resolve_objects
 from dro_grasp.objects.procedural import FAMILIES, SIZE, THINNEST, procedural_object
 from dro_grasp.objects.solids import Solid
-from dro_grasp.training.data.engine.schedule import require_distinct, require_known
+from dro_grasp.training.data.engine.schedule import require_distinct_names, require_known
 from tests.helpers.exact_parts import require_exact_parts
 
 SEEDS = range(16)
@@ -58,7 +58,7 @@ def test_a_name_and_a_range_stand_for_them(drawn) -> None:
     assert resolve_objects(["procedural:7-9", "mug"]) == ["procedural_7", "procedural_8", "procedural_9", "mug"]
     assert locate_object("procedural_7")[1] == "procedural_7"
     require_known(["barrett"], ["procedural_7"])
-    require_distinct(["barrett"], ["procedural_7", "procedural_8"])
+    require_distinct_names(["barrett"], ["procedural_7", "procedural_8"])
     half = load_object("procedural_7", scale=0.5)
     np.testing.assert_allclose(half.extents, drawn[7].extents / 2, rtol=1e-5)
 

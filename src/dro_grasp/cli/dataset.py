@@ -67,13 +67,13 @@ class Synthesize:
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimize.contacts import ContactConfig
         from dro_grasp.optimize.synthesis import SynthesisConfig
-        from dro_grasp.training.data.engine.schedule import require_distinct, require_known, synthesize_dataset
+        from dro_grasp.training.data.engine.schedule import require_distinct_names, require_known, synthesize_dataset
         from dro_grasp.training.data.engine.worker import EngineConfig
 
         self._check_numbers()
         objects = resolve_objects(list(self.object))
         require_known(self.hand, objects)
-        require_distinct(self.hand, objects)
+        require_distinct_names(self.hand, objects)
         for name in self.hand:
             with suppress(HandError):  # told with its pairs
                 say_doubts(load_hand_description(name)[0])

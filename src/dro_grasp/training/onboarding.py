@@ -41,7 +41,7 @@ from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.data.bundle.training_file import load_bundle, split_of
 from dro_grasp.training.data.collections.bundling import make_bundle
 from dro_grasp.training.data.collections.collection import count_collection
-from dro_grasp.training.data.engine.schedule import FREE, require_distinct, require_known, synthesize_dataset
+from dro_grasp.training.data.engine.schedule import FREE, require_distinct_names, require_known, synthesize_dataset
 from dro_grasp.training.data.engine.shards import sole_run
 from dro_grasp.training.data.engine.worker import EngineConfig
 from dro_grasp.training.loop import train
@@ -171,7 +171,7 @@ def onboard(
         raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name others (objects=..., "
                           "held_out=...)")
     require_known([hand], [*objects, *held_out])
-    require_distinct([hand], objects)
+    require_distinct_names([hand], objects)
     locate_weights(config.weights)
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     with sole_run(make_folder(path)):

@@ -159,7 +159,7 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
                               f"{LONGEST_NAME} at most. Give a shorter path, such as one from the file's own folder")
 
 
-def require_distinct(hands: Sequence[str], objects: Sequence[str]) -> None:
+def require_distinct_names(hands: Sequence[str], objects: Sequence[str]) -> None:
     """Refuse different files of one name, before their grasps are made: merged and bundled grasps know their names alone."""
     for kind, given, locate in (("hand", hands, locate_hand), ("object", objects, locate_object)):
         found: dict[str, tuple[str, Path]] = {}
