@@ -99,7 +99,7 @@ def test_powers_that_say_nothing_are_refused(value: float) -> None:
 
 
 @pytest.mark.parametrize(("make", "told"), [
-    (lambda: TrainConfig(samples_per_hand=0), r"samples_per_hand is 0; give a number from 1 on \(samples_per_hand=...\)"),
+    (lambda: TrainConfig(samples_per_hand=0), r"samples_per_hand is 0; give at least 1 \(samples_per_hand=...\)"),
     (lambda: TrainConfig(hands_per_step=0), "hands_per_step is 0"), (lambda: TrainConfig(columns=-1), "columns is -1"),
     (lambda: AugmentationConfig(partial=5.0), "partial is 5.0; give a share from 0 to 1"),
     (lambda: AugmentationConfig(object_noise=-0.1), "object_noise is -0.1"),

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dro_grasp.errors import OptionError
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, require_positive
 
 
-def _require(config: object, least: int, *names: str) -> None:
-    """Refuse fields of a configuration that are less than `least`, infinite or NaN: OptionError."""
+def _require_from_zero(config: object, *names: str) -> None:
+    """Refuse fields of a configuration that are negative, infinite or NaN: OptionError."""
     for name in names:
-        if not least <= (value := getattr(config, name)) < math.inf:
-            raise OptionError(f"{name} is {value}; give a number from {least} on ({name}=...)")
+        if not 0 <= (value := getattr(config, name)) < math.inf:
+            raise OptionError(f"{name} is {value}; give a number from 0 on ({name}=...)")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class AugmentationConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, 0, "object_noise", "placement_rotation", "placement_shift", "tilt", "proportions")
+        _require_from_zero(self, "object_noise", "placement_rotation", "placement_shift", "tilt", "proportions")
         if not 0 <= self.partial <= 1:
             raise OptionError(f"partial is {self.partial}; give a share from 0 to 1 (partial=...)")
 
@@ -68,7 +68,7 @@ class LossConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, 0, "distance", "pose", "penetration", "divergence", "motion", "flow", "placement")
+        _require_from_zero(self, "distance", "pose", "penetration", "divergence", "motion", "flow", "placement")
 
 
 LOSSES = {"ours": LossConfig(), "release": LossConfig(penetration=1.0, divergence_form="official")}
@@ -129,7 +129,7 @@ class TrainConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, 1, "hands_per_step", "samples_per_hand", "columns")
+        require_positive(hands_per_step=self.hands_per_step, samples_per_hand=self.samples_per_hand, columns=self.columns)
         if not 0 <= self.by_count <= 1:
             raise OptionError(f"by_count is {self.by_count}; give 0 to draw all hands equally often, 1 to draw them by their "
                               "grasps, or a number between")
