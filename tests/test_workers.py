@@ -1,9 +1,11 @@
-"""Worker processes end with the process that started them."""
+"""Worker processes end with the process that started them; memory stays with processes that need it again."""
 
 from __future__ import annotations
 
 import os
+import platform
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -58,3 +60,22 @@ def test_nothing_is_computed_on_once_the_parent_is_killed(script: str, tmp_path:
     finally:
         if alive(worker):
             os.kill(worker, signal.SIGKILL)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only its way of keeping memory is known")
+def test_memory_that_a_command_frees_is_at_hand_again() -> None:
+    """Three blocks of 20 MB, again and again: more than glibc keeps of itself, and 15,000 pages to ask for each time."""
+    code = """
+import contextlib, io, resource
+from dro_grasp.cli.main import main
+with contextlib.redirect_stdout(io.StringIO()):
+    main(["--version"])
+for turn in range(8):
+    if turn == 3:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    held = [b"x" * 20_000_000 for _ in range(3)]
+    del held
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1_000

@@ -25,6 +25,7 @@ from dro_grasp.cli.switches import in_switches, use_options_of
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, Serve, View
 from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.workers import keep_memory
 
 DONE = 0  # Exit code of a command that succeeded
 FAILED = 1  # Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`
@@ -110,6 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
     os.environ.setdefault(*WAIT_POLICY)
+    keep_memory()
     try:
         return run(arguments)
     except BrokenPipeError:  # as in `| head`; rich ends its own output in the same way
