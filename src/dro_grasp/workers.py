@@ -19,7 +19,8 @@ from multiprocessing import connection
 KEPT = 32 * 2**20
 """Largest block that stays with the process when it is freed, and half of what stays in all [bytes]: as much as glibc comes to
 by itself at most, where the order of blocks lets it."""
-BLOCK, IN_ALL = -3, -1  # Parameters of glibc's mallopt for these bounds
+BLOCK = -3  # Parameter of glibc's mallopt for the first of these bounds
+IN_ALL = -1  # And for the second
 
 
 def use_one_thread(simulating: int = 1) -> None:
