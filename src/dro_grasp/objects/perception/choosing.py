@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.mesh_files import trimesh
-from dro_grasp.objects.perception.raised import joined_rest, raised
+from dro_grasp.objects.perception.raised import around, joined_rest, raised
 from dro_grasp.objects.perception.segmentation import BACK, NOTHING, OTHER, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.perception.things import place_of, size_of
 from dro_grasp.objects.reading import numbers
@@ -28,8 +28,11 @@ BORDER = 3  # Pixels from the image's border that touch it (ours)
 EDGE = 0.01  # The same of a cloud, as a share of its width [1] (ours)
 TOLD = 8  # Things that a message lists (ours)
 ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
+BOARD = 0.006  # Height from which those of another plane are none [m] (ours)
+AT_FOOT = 0.03  # Way aside from a thing to what is seen of the plane on which it stands [m] (ours)
 PART_OF = 0.025  # Gap to another thing that may be a part of the one that is meant [m] (ours)
 LEAST_MASK = 60  # Fewest points in a mask (ours)
+MISSED = 1 / 160  # Width of an outline that masks miss, over the image's width [1] (ours): 4 of 640 pixels
 SLIVER = 0.1  # Share of a mask's points below which a thing that is mostly beside it is not meant [1] (ours)
 COVERED = 0.5  # Share of a plane's points in a mask from which the plane is a face of the object [1] (ours)
 SECOND = 0.5  # Share of another thing's points in a mask from which it is told that the thing is left out [1] (ours)
@@ -401,41 +404,73 @@ def _chosen(
     """What is chosen with these points, and what is uncertain; those that are raised stand on no plane on which they lie."""
     labels, taken = segments.labels, np.zeros(len(sight.points), bool)
     taken[own] = True
-    below = _below(sight, segments, own, higher)
-    avoided = (labels != NOTHING) & ~taken
+    planes = _plane_of(sight, segments)
+    below = _below(sight, segments, own, planes, higher)
+    avoided = (labels != NOTHING) & ~taken & ~_outline(sight, segments, taken, planes)
     # Specks beside a thing are parts of it that the camera saw badly, or what it scatters at its outline.
     specks = np.flatnonzero(labels == SPECK)
     if len(specks):
         avoided[specks[KDTree(sight.points[own]).query(sight.points[specks])[0] < BESIDE]] = False
     if below is not None:
         plane = segments.planes[below]
-        # Hands stay above the table by another way.
-        avoided &= (labels >= 0) | (np.abs(sight.points @ plane[:3] - plane[3]) > ON_TABLE)
+        # Hands stay above the table by another way, and not above a thin board that lies on it.
+        board = (planes >= 0) & (planes != below)
+        height = sight.points @ plane[:3] - plane[3]
+        avoided &= (labels >= 0) | (np.abs(height) > ON_TABLE) | (board & (height > BOARD))
         notes = (*notes, *_side_of_box(sight, segments, own, below))
     return Chosen(own, np.flatnonzero(avoided), below, sight.pixels[own], (*notes, *_cut_off(sight, own)))
 
 
-def _below(sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], higher: bool) -> int | None:
-    """The plane on which a thing stands: the highest below it, of those that are as level as the largest that can be one.
+def _outline(
+    sight: Sight, segments: Segments, taken: Bool[np.ndarray, " n"], planes: Int[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Which points are just beside those that are taken, and on what the object is made of: masks end before it does.
 
-    A plane that is a face of the thing is none; of what is raised, each plane on which some of it lies.
+    Such are the part of a thing, or the plane, that has most of the points, and those of which most is taken.
+    """
+    if sight.shape is None:
+        return np.zeros(len(taken), bool)
+    sides = int(segments.parts.max(initial=0)) + 1
+    kind = np.where(planes < 0, (segments.labels - SPECK) * sides + segments.parts, (segments.count - SPECK) * sides + planes)
+    count = int(kind.max()) + 1
+    whole, part = np.bincount(kind, minlength=count), np.bincount(kind[taken], minlength=count)
+    mine = part > COVERED * whole
+    mine[part.argmax()] = True
+    return around(sight, taken, MISSED) & mine[kind]
+
+
+def _below(
+    sight: Sight, segments: Segments, own: Int[np.ndarray, " k"], planes: Int[np.ndarray, " n"], higher: bool
+) -> int | None:
+    """The plane on which a thing stands: of those that are seen beside it, else of all, the nearest to its lowest points.
+
+    It is as level as the largest that can be one. A plane that is a face of the thing is none; of what is raised, each plane
+    on which some of it lies.
     """
     if not segments.planes:
         return None
     points, mine = sight.points[own], np.zeros(len(sight.points), bool)
     mine[own] = True
-    plane_of = _plane_of(sight, segments)
-    faces = _covered(segments, plane_of, mine)
+    faces = _covered(segments, planes, mine)
     if higher:
-        faces |= np.bincount(plane_of[mine & (plane_of >= 0)], minlength=len(faces)) > 0
+        faces |= np.bincount(planes[mine & (planes >= 0)], minlength=len(faces)) > 0
     normals = np.array([plane[:3] for plane in segments.planes])
     up = normals[0]
     if sight.from_camera and (level := np.abs(sight.T[2, :3] @ normals.T) > 0.9).any():
         up = normals[level.argmax()]
     # The lowest points, less those that noise puts lower (ours).
     lows = [float(np.quantile(points @ plane[:3] - plane[3], 0.02)) for plane in segments.planes]
-    fits = [(low, i) for i, low in enumerate(lows) if normals[i] @ up > 0.9 and low > -0.02 and not faces[i]]
-    return min(fits)[1] if fits else None
+    fits = [i for i, low in enumerate(lows) if normals[i] @ up > 0.9 and low > -0.02 and not faces[i]]
+    flat = np.linalg.svd(up[None])[2][1:]
+    own_foot = KDTree(_some(points) @ flat.T)
+    beside = [i for i in fits if (seen := planes == i).any()
+              and own_foot.query(_some(sight.points[seen]) @ flat.T)[0].min() < AT_FOOT]
+    return min(beside or fits, key=lambda i: abs(lows[i]), default=None)
+
+
+def _some(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Every few of many points."""
+    return points[:: max(1, len(points) // 8000)]
 
 
 CLOUD_EDGE = "the cloud's edge"  # Where a cloud without an image ends

@@ -33,7 +33,7 @@ def raised(
     on no plane, what is as low as the ground around the mask is left out, and what is far from the mask's middle.
     """
     assert sight.shape is not None
-    ring = _ring(sight, inside)
+    ring = around(sight, inside, RING)
     faces = np.zeros(len(inside), bool)
     for k in np.unique(plane[inside & (plane >= 0)]):
         height = sight.points[ring] @ segments.planes[k][:3] - segments.planes[k][3]
@@ -45,6 +45,15 @@ def raised(
     return faces, rest & _over_ground(sight, segments, inside, ring)
 
 
+def around(sight: Sight, inside: Bool[np.ndarray, " n"], wide: float) -> Bool[np.ndarray, " n"]:
+    """Which points surround others in the image, up to a share of its width."""
+    assert sight.shape is not None
+    mask = np.zeros(sight.shape, bool)
+    mask.ravel()[sight.pixels[inside]] = True
+    grown = ndimage.binary_dilation(mask, np.ones((3, 3)), iterations=max(1, round(wide * sight.shape[1])))
+    return np.asarray(grown).ravel()[sight.pixels] & ~inside
+
+
 def joined_rest(
     points: Float[np.ndarray, "n 3"], faces: Bool[np.ndarray, " n"], rest: Bool[np.ndarray, " n"]
 ) -> Int[np.ndarray, " k"]:
@@ -53,15 +62,6 @@ def joined_rest(
     if faces.sum() < rest.sum():
         return own
     return own[KDTree(points[faces]).query(points[own])[0] < REST] if faces.any() else own
-
-
-def _ring(sight: Sight, inside: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Which points surround a mask in the image."""
-    assert sight.shape is not None
-    mask = np.zeros(sight.shape, bool)
-    mask.ravel()[sight.pixels[inside]] = True
-    grown = ndimage.binary_dilation(mask, np.ones((3, 3)), iterations=max(1, round(RING * sight.shape[1])))
-    return np.asarray(grown).ravel()[sight.pixels] & ~inside
 
 
 def _whole_pieces(sight: Sight, own: Bool[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
@@ -85,8 +85,8 @@ def _over_ground(
         return inside
     near = np.linalg.norm(sight.points - np.median(sight.points[inside], axis=0), axis=1) < AROUND
     height = sight.points @ _up(sight, segments)
-    around = near & (inside | ring)
-    return near & (height > np.quantile(height[around], GROUND) + OVER) if around.any() else near
+    here = near & (inside | ring)
+    return near & (height > np.quantile(height[here], GROUND) + OVER) if here.any() else near
 
 
 def _up(sight: Sight, segments: Segments) -> Float[np.ndarray, "3"]:
