@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.scenery import Scene
-from tests.helpers.made_scenes import MadeScene, make_scene, render_scene, touching
+from tests.helpers.made_scenes import MadeScene, make_scene, overlap, render_scene, touching
 
 
 def _box(x: float, y: float, z: float, *extents: float) -> trimesh.Trimesh:
@@ -60,3 +60,12 @@ def test_a_thing_stands_on_what_is_below_it_and_not_on_a_board_elsewhere(thick: 
         assert moved_plane(scene.segments.planes[chosen.below], scene.sight.T)[3] == pytest.approx(height, abs=0.003)
     board = (made.owner == 1).sum()
     assert _avoided(made, scene, made.owner == 0, 1) > 0.9 * board, "hands keep off it"
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.005])
+def test_low_things_are_found_in_sharp_noisy_images(noise: float) -> None:
+    """The tails of the noise are no layer over the table that takes low things in."""
+    made = _made(_box(-0.1, 0, 0, 0.08, 0.06, 0.015), _box(0.1, 0.05, 0, 0.08, 0.06, 0.02), noise=noise, width=720)
+    scene = made.load()
+    for k, middle in enumerate(made.middles):
+        assert overlap(made, k, scene.chosen(at=tuple(middle)).pixels) > 0.8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,11 +11,12 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
 from dro_grasp.geometry.point_groups import local_normals
-from dro_grasp.geometry.table_plane import largest_plane, scatter, thickness
+from dro_grasp.geometry.table_plane import MOST_THICK, WINDOW, largest_plane, scatter, thickness
 from dro_grasp.objects.perception.seams import Surface, joined, parted
 
 CELL = 0.004  # Edge of the cubes whose points are averaged [m] (ours): noise of single pixels goes, a finger's width stays
 NOISES = 2.0  # Standard deviations of the noise that a cube measures at least [1] (ours)
+TAILS = 3.5  # Standard deviations of the noise beyond which points are too few to hang together [1] (ours)
 REFITS = 2  # Fits to the points of a plane that is noisy (ours)
 MOST_EDGE = 0.008  # Largest edge for their sake [m] (ours)
 MOST_CELLS = 45_000  # Filled cubes above which they grow (ours): what two cores take apart in 2 s
@@ -79,9 +80,8 @@ def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
     as in DBSCAN. Source: Fischler and Bolles 1981; Ester et al. 1996.
     """
     view = _View.of(points, camera)
-    edge = _edge(view, points)
-    if edge > view.edge:
-        view = _View.of(points, camera, edge)
+    edge, noise = _edge(view, points)
+    view = replace(_View.of(points, camera, edge) if edge > view.edge else view, noise=noise)
     planes = _planes(view)
     owned = np.full(len(view.cells), NOTHING)
     for plane in planes:
@@ -104,6 +104,7 @@ class _View:
     camera: Float[np.ndarray, "3"] | None
     cell_of: Int[np.ndarray, " n"]  # cube of each point; -1 for points too far away
     points: Float[np.ndarray, "n 3"]  # [m]
+    noise: float = 0.0  # standard deviation of the points of the largest plane around those beside them [m]
 
     @classmethod
     def of(
@@ -122,13 +123,22 @@ class _View:
         return cls(cells, normals, edge, camera, cell_of, points)
 
 
-def _edge(view: _View, points: Float[np.ndarray, "n 3"]) -> float:
-    """Edge of cubes in which noise averages out, as the points near the largest plane scatter [m]."""
+def _edge(view: _View, points: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
+    """Edge of cubes in which noise averages out, as the points near the largest plane scatter, and their noise alone [m].
+
+    Apart from noise, they scatter where a plane is bent, or two are nearly one.
+    """
     fit = largest_plane(view.cells, NEAR, fits=3)
     if fit is None:
-        return CELL
+        return CELL, 0.0
+    height = points @ fit[:3] - fit[3]
     facing = (np.abs(view.normals @ fit[:3]) > TILTED)[view.cell_of] & (view.cell_of >= 0)
-    return min(NOISES * scatter((points @ fit[:3] - fit[3])[facing]), MOST_EDGE)
+    near = np.flatnonzero(facing & (np.abs(height) < WINDOW))
+    at = np.floor(points[near] @ np.linalg.svd(fit[None, :3])[2][1:].T / PATCH).astype(int)
+    at -= at.min(0, initial=0)
+    square = at[:, 0] * (at[:, 1].max(initial=0) + 1) + at[:, 1]
+    middle = np.bincount(square, height[near]) / np.maximum(np.bincount(square), 1)
+    return min(NOISES * scatter(height[facing]), MOST_EDGE), scatter(height[near] - middle[square])
 
 
 def _averaged(points: Float[np.ndarray, "n 3"], edge: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " n"], float]:
@@ -216,7 +226,8 @@ def _planes(view: _View) -> list[_Plane]:
 def _seen_plane(view: _View, pool: Int[np.ndarray, " p"], fit: Float[np.ndarray, "4"]) -> _Plane:
     height = view.cells[pool] @ fit[:3] - fit[3]
     facing = np.abs(view.normals[pool] @ fit[:3]) > TILTED
-    thick = thickness(height[facing])
+    # Cubes average noise away, but for those at its tails: they hold a few points each, and would be a crust of the plane.
+    thick = max(thickness(height[facing]), min(TAILS * view.noise, MOST_THICK))
     own = pool[(np.abs(height) <= thick) & facing]
     axes = np.linalg.svd(fit[None, :3])[2][1:]
     along = view.cells[own] @ axes.T
