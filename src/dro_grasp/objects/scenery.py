@@ -109,7 +109,8 @@ class Scene:
         if self.sight is None:
             raise ObjectError(f"the scene '{self.name}' is a mesh; give what a camera saw, a cloud or a depth image, to take "
                               "one object out of it, or the object's own mesh")
-        return segment(self.sight.points, np.zeros(3) if self.sight.from_camera else None)
+        camera, up = (np.zeros(3), self.sight.T[2, :3]) if self.sight.from_camera else (None, None)
+        return segment(self.sight.points, camera, up)
 
     def points_seen(self) -> Float[np.ndarray, "n 3"]:
         """All points as they were seen, in the scene's frame [m], as `segments` label them."""
@@ -279,9 +280,12 @@ def _check_coordinates(points: Float[np.ndarray, "n 3"], origin: str) -> None:
     if not len(points):
         raise ObjectError(f"{origin} holds no point: all are NaN or (0, 0, 0). Look from where the camera "
                           "measures depths, or leave obstacles out if nothing is to be avoided")
-    if np.abs(points).max() > FARTHEST:
-        raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m; divide millimetres by 1000 "
-                          f"(scale), and leave out what is farther away than {FARTHEST:g} m")
+    far = np.abs(points).max(1) > FARTHEST
+    if far.any():
+        what_to_do = ("Give them as 0 or NaN if the camera measured nothing there" if far.mean() < 0.5 else
+                      "Divide millimetres by 1000 (scale)")
+        raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m: {far.sum()} of its {len(far)} "
+                          f"points are farther away than {FARTHEST:g} m. {what_to_do}")
 
 
 def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Distance:

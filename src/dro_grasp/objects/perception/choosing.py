@@ -25,7 +25,9 @@ ON = 0.01  # Way from a given place to a point of a thing up to which it lies on
 BESIDE = 0.05  # Longest way from a given place to the thing that is meant [m] (ours)
 ASIDE = 12  # Longest way from a given pixel to one with a depth [pixels] (ours)
 BORDER = 3  # Pixels from the image's border that touch it (ours)
+FULL = 0.3  # Share of a column of the image that has depths beside a thing, unless the camera measures none there [1] (ours)
 EDGE = 0.01  # The same of a cloud, as a share of its width [1] (ours)
+FAR = 3.0  # Median distance from which the unit of a view without things is doubted [m] (ours)
 TOLD = 8  # Things that a message lists (ours)
 ON_TABLE = 0.02  # Points of planes nearer to the table than this are its own [m] (ours)
 BOARD = 0.006  # Height from which those of another plane are none [m] (ours)
@@ -110,7 +112,7 @@ def choose(
         return _chosen(sight, segments, own, (*notes, *_left_out(sight, segments, inside, own)), higher)
     if not segments.count:
         raise ObjectError(f"nothing stands out in '{name}': it shows {_planes(segments)} and no thing on it of 4 cm² or more "
-                          "and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG)")
+                          f"and at most 60 cm; look from nearer, or give the object's pixels (mask=PNG){_far(sight)}")
     side = None
     if at is not None:
         number, side = _at(name, sight, segments, at)
@@ -128,6 +130,13 @@ def choose(
     own = np.flatnonzero(mine & (segments.parts == side) if part else mine)
     notes = (*_touching(segments, number, mine, part), *_beside(sight, segments, own))
     return _chosen(sight, segments, own, notes)
+
+
+def _far(sight: Sight) -> str:
+    """What to do where all is so far away that the unit may be wrong."""
+    away = float(np.median(np.linalg.norm(sight.points, axis=1))) if sight.from_camera and len(sight.points) else 0.0
+    return "" if away < FAR else (f". Half of what it shows is farther away than {away:.1f} m: if it was nearer, state "
+                                  "\"depth_unit\" in the camera's file (0.0001 for tenths of a millimetre), or give a scale")
 
 
 def _touching(segments: Segments, number: int, mine: Bool[np.ndarray, " n"], part: bool) -> tuple[str, ...]:
@@ -485,6 +494,11 @@ def _cut_off(sight: Sight, own: Int[np.ndarray, " k"]) -> tuple[str, ...]:
         low, high = image[own].min(0), image[own].max(0)
         size = np.array(sight.shape[::-1]) - 1
         cut, what = bool((low < BORDER).any() or (high > size - BORDER).any()), "the image's border"
+        # Stereo cameras measure no depth in a band along one side, where all else ends as well.
+        others = np.bincount(np.delete(image[:, 0], own).astype(int), minlength=sight.shape[1])
+        full = np.flatnonzero(others > FULL * sight.shape[0])
+        if not cut and len(full):
+            cut, what = bool(low[0] < full[0] + BORDER or high[0] > full[-1] - BORDER), "where the image's depths end"
     else:
         flat = sight.points[:, :2] / np.maximum(sight.points[:, 2:], 1e-9) if sight.from_camera else sight.points[:, :2]
         margin = EDGE * np.ptp(flat, axis=0)

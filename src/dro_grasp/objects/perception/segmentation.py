@@ -38,6 +38,7 @@ WALL_THICK = 0.016  # Half thickness of such a wall [m] (ours)
 LONGEST_FACE = 0.35  # Longest thing that is all one plane: what is longer is a wall seen from outside [m] (ours)
 FLOATS = 0.04  # Height above all planes from which a thing floats, so that it is a part of one below it [m] (ours)
 GAP = 0.06  # Largest gap between these [m] (ours)
+LONGEST_JOINED = 0.35  # Longest thing that both may be [m] (ours): what floats is a lamp or an arm else
 UNDER = 0.01  # Distance aside up to which one is below the other [m] (ours)
 BACK = 0.03  # Points so far behind a plane are the edges of its board [m] (ours)
 LINK = 2.5  # Longest distance of neighbours of one thing, in cubes [1] (ours)
@@ -73,9 +74,12 @@ class Segments:
         return len(self.seams)
 
 
-def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None) -> Segments:
+def segment(
+    points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None, up: Float[np.ndarray, "3"] | None = None
+) -> Segments:
     """Take a cloud apart, which the camera sees from its place [m]; without one, it was seen from all sides.
 
+    Things stand on planes that are level, as far as the way up is known and such are seen, else on those along the largest.
     Large planes come first, by sampled fits. What is left is joined by distance between points that have enough neighbours,
     as in DBSCAN. Source: Fischler and Bolles 1981; Ester et al. 1996.
     """
@@ -88,7 +92,7 @@ def segment(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
         owned[plane.owns(view)] = STRUCTURE
     rest = np.flatnonzero(owned == NOTHING)
     parts = np.zeros(len(view.cells), int)
-    owned[rest], parts[rest], seams = _things(view, rest, [plane.plane for plane in planes])
+    owned[rest], parts[rest], seams = _things(view, rest, _levels([plane.plane for plane in planes], up))
     seen = view.cell_of >= 0
     return Segments(np.where(seen, owned[view.cell_of], OTHER), tuple(p.plane for p in planes), tuple(p.area for p in planes),
                     seams, np.where(seen, parts[view.cell_of], 0))
@@ -291,8 +295,14 @@ def _is_structure(view: _View, plane: _Plane, found: list[_Plane]) -> bool:
     return float((plane.height(within) < -BACK).mean()) < 0.1 if len(within) else True
 
 
+def _levels(planes: list[Float[np.ndarray, "4"]], up: Float[np.ndarray, "3"] | None) -> list[Float[np.ndarray, "4"]]:
+    """The planes on which things stand, largest first."""
+    level = [plane for plane in planes if up is not None and plane[:3] @ up > 0.9]
+    return level or [plane for plane in planes if plane[:3] @ planes[0][:3] > 0.9]
+
+
 def _things(
-    view: _View, rest: Int[np.ndarray, " r"], planes: list[Float[np.ndarray, "4"]]
+    view: _View, rest: Int[np.ndarray, " r"], levels: list[Float[np.ndarray, "4"]]
 ) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"], tuple[bool, ...]]:
     """The label and the part of each cube that is left, and whether a seam runs over each thing."""
     cells = view.cells[rest]
@@ -302,7 +312,6 @@ def _things(
     pairs = KDTree(cells).query_pairs(max(0.01, LINK * view.edge), output_type="ndarray")
     core = np.bincount(pairs.ravel(), minlength=len(rest)) >= CORE
     group = joined(pairs[core[pairs].all(1)], len(rest))
-    levels = [plane for plane in planes if plane[:3] @ planes[0][:3] > 0.9]
     _join_floating(cells, group, levels)
     sizes = np.bincount(group)
     large = [int(g) for g in np.argsort(-sizes, kind="stable") if sizes[g] >= LEAST_THING]
@@ -357,8 +366,11 @@ def _join_floating(
         beside = KDTree(own @ flat.T).query(cells[below] @ flat.T)[0] < UNDER
         gap = KDTree(own).query(cells[below])[0]
         near = below[beside & (gap < GAP)]
-        if len(near):
-            group[group == g] = group[near[gap[beside & (gap < GAP)].argmin()]]
+        if not len(near):
+            continue
+        under = group[near[gap[beside & (gap < GAP)].argmin()]]
+        if np.ptp(cells[(group == g) | (group == under)], axis=0).max() <= LONGEST_JOINED:
+            group[group == g] = under
 
 
 def _take_fragments(
