@@ -230,7 +230,7 @@ def test_scenes_that_are_none_are_refused(tmp_path) -> None:
         load_scene(tmp_path / "nowhere.ply")
     for points, message in (
         (np.zeros((0, 3)), "holds no point"), (np.full((4, 3), np.nan), "holds no point"),
-        (np.ones((4, 2)), r"expected \(n, 3\)"), (np.full((4, 3), 5000.0), "divide millimetres by 1000"),
+        (np.ones((4, 2)), r"expected \(n, 3\)"), (np.full((4, 3), 5000.0), "Divide millimetres by 1000"),
     ):
         with pytest.raises(ObjectError, match=message):
             load_scene(points)

@@ -47,7 +47,7 @@ def test_settings_are_noted_where_the_file_system_has_no_links(tmp_path, monkeyp
     monkeypatch.setattr("os.link", no_link)
     run(tmp_path, ["a"], ["x"], 5)
     assert json.loads((tmp_path / SETTINGS).read_text())["seed"] == 0
-    assert sorted(path.name for path in tmp_path.glob("*.*")) == [".lock", ".process", SETTINGS]
+    assert sorted(path.name for path in tmp_path.glob("*.*")) == [".lock", SETTINGS]
 
 
 def test_damaged_settings_are_named(tmp_path):

@@ -348,4 +348,4 @@ def test_the_bundle_needs_only_what_a_bare_training_machine_has():
     bundle = {"dro_grasp.training.data.bundle", *graph.find_descendants("dro_grasp.training.data.bundle")}
     needed = {name.partition(".")[0] for module in bundle for name in graph.find_upstream_modules(module)}
     assert needed - set(sys.stdlib_module_names) == {
-        "dro_grasp", "jaxtyping", "numpy", "pyarrow", "roma", "safetensors", "torch"}
+        "dro_grasp", "filelock", "jaxtyping", "numpy", "pyarrow", "roma", "safetensors", "torch"}  # torch needs filelock
