@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import threading
 from pathlib import Path
 
 import pyarrow as pa
@@ -216,3 +218,23 @@ def test_a_hold_that_nobody_knows_is_none_in_a_file_too(tmp_path: Path) -> None:
     known = make(2).replace(extra={name: torch.ones(2, 3) for name in HOLD_COLUMNS})
     GraspBatch.concatenate([known, make(2)])[[2, 3]].save(tmp_path / "none.parquet")
     assert HoldExpectation.of(GraspBatch.load(tmp_path / "none.parquet"), 0) is None
+
+
+def test_a_file_that_a_run_replaces_meanwhile_is_read_whole(tmp_path: Path) -> None:
+    few, many = (evaluated(count).to_bytes() for count in (2, 200))
+    path, written = tmp_path / "g.parquet", threading.Event()
+    path.write_bytes(few)
+
+    def run() -> None:
+        while not written.is_set():
+            for content in (many, few):
+                (tmp_path / "new").write_bytes(content)
+                os.replace(tmp_path / "new", path)
+
+    run_beside = threading.Thread(target=run)
+    run_beside.start()
+    try:
+        assert {len(GraspBatch.load(path)) for _ in range(100)} <= {2, 200}
+    finally:
+        written.set()
+        run_beside.join()

@@ -125,10 +125,16 @@ def _leaves(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
 def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]:
     """A grasp file's table and header; GraspFileError: it is missing, truncated, foreign, or of another version."""
     with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
-        table = pq.read_table(_existing(path))
+        table = read_parquet(_existing(path))
         header = read_header(path, table.schema)
         check_columns(table.schema, path)
     return table, header
+
+
+def read_parquet(source: Path | io.BytesIO) -> pa.Table:
+    """The table of a file, opened once, so that it is whole where a run replaces the file meanwhile."""
+    with pq.ParquetFile(source) as file:
+        return file.read()
 
 
 def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:

@@ -191,6 +191,7 @@ def test_a_run_that_is_stopped_begins_nothing_more_and_keeps_what_has_ended(
         parent.wait(20)
     finally:
         parent.kill()
+        parent.wait()
     wait_for(lambda: not any(alive(pid) for pid in started))
     assert sorted((a.object, a.number) for a in read_attempts(output)) == [("can", 0), ("torus", 0)]
 

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from dro_grasp.arm.planning.motion import PLACING
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import locking, reading, replacing
+from dro_grasp.grasps.grasp_file import read_parquet
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def read_attempts(path: Path) -> list[Attempt]:
     known = {f.name for f in fields(Attempt)}
     expected = "a file of attempts; name another one, or move this one away"
     with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing
-        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in pq.read_table(path).to_pylist()]
+        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in read_parquet(path).to_pylist()]
 
 
 def lifted(attempts: Sequence[Attempt]) -> list[Attempt]:
