@@ -73,8 +73,8 @@ data: setup  # synthesize grasps that hold (MINUTES=600 stops then, with grasps 
 labels: setup  # keep what of the shipped grasps passes carry and robust, and merge it with the data
 	$(RECIPE) labels $(RECIPE_OPTIONS)
 
-weights: setup  # bundle, pretrain, train, scores, completion; then the set of weights is put where it ships
-	$(RECIPE) weights $(RECIPE_OPTIONS)
+weights: setup  # bundle, pretrain, train, scores, completion; then the set is put where it ships (GRASPS=FOLDER: of these grasps)
+	$(RECIPE) weights $(RECIPE_OPTIONS) $(if $(GRASPS),--grasps $(GRASPS))
 
 rehearse: setup  # data, labels and weights in small, without assets, killed once
 	rm -rf out/tiny

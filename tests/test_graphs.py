@@ -97,6 +97,7 @@ def test_work_on_the_cpu_is_never_recorded() -> None:
     assert len(calls) == 3
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_after_a_refused_capture_numbers_are_drawn_and_memory_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = CapturingCuda(monkeypatch)
     generator, drawn = Generator(cuda), list[int]()
@@ -115,6 +116,7 @@ def test_after_a_refused_capture_numbers_are_drawn_and_memory_is_given_back(monk
     assert not cuda.users.total()
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_work_that_fails_as_it_is_captured_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = CapturingCuda(monkeypatch)
     generator, drawn = Generator(cuda), list[int]()
@@ -133,6 +135,7 @@ def test_work_that_fails_as_it_is_captured_is_launched(monkeypatch: pytest.Monke
     assert not cuda.users.total()
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_repeated_steps_share_their_memory_and_recorded_work_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = CapturingCuda(monkeypatch)
 

@@ -1,6 +1,7 @@
 """Make data, labels and weights by commands of this repository.
 
-    python -m lab.recipe data labels weights [--folder out] [--tiny] [--device auto] [--workers N] [--minutes M] [--list]
+    python -m lab.recipe data labels weights [--folder out] [--tiny] [--device auto] [--workers N] [--minutes M]
+        [--grasps FOLDER] [--list]
 
 A rerun goes on where the last run was stopped or killed: steps that are done, of the same command on the same files, are not
 run again. `FOLDER/recipe.json` states what was run, on what, how long. `--tiny` rehearses everything in minutes, without
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from hashlib import sha256
 from typing import Any
 
@@ -48,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1,
                         help=f"processes on the processor; with a device, threads of the {FEEDING} processes that feed it")
     parser.add_argument("--minutes", type=float, help="time limit of `data`, divided among its steps; run again to go on")
+    parser.add_argument("--grasps", help="of these `weights` are made, instead of what `labels` made in the folder")
     parser.add_argument("--list", action="store_true", help="only print the commands")
     options = parser.parse_args(argv)
     device = choose_device(options.device)
@@ -55,8 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("weights state the commit of the code that makes them; commit your changes first, and leave the code as it is "
               "until they are done, for instance in a worktree of its own", file=sys.stderr)
         return 2
+    size = TINY if options.tiny else FULL
+    if options.grasps:
+        size = replace(size, learned=options.grasps)
     for stage in options.stages:
-        for step in STAGES[stage](TINY if options.tiny else FULL, options.folder):
+        for step in STAGES[stage](size, options.folder):
             made = Attempt(step, options.folder, options.workers, device, options.minutes, options.tiny)
             if options.list:
                 print(made.told())

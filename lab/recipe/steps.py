@@ -56,6 +56,7 @@ class Size:
     holding: str
     completion: str
     into: str  # folder of the finished weights
+    learned: str = "{folder}/grasps"  # folder of the grasps that weights are made of
 
 
 FIRST_MADE = 100
@@ -90,9 +91,16 @@ def made_hands(size: Size, folder: str) -> list[str]:
     return [f"{folder}/made_hands/hand_{seed:05d}.urdf" for seed in range(FIRST_MADE, FIRST_MADE + size.made)]
 
 
+def drawn_hands(size: Size, folder: str) -> Step:
+    """The step that makes them."""
+    made = f"{folder}/made_hands"
+    return Step("made hands", f"dro-grasp hand make --seed {FIRST_MADE} --num {size.made} --output {made} --overwrite",
+                f"{made}/hands.csv")
+
+
 def data(size: Size, folder: str) -> list[Step]:
     """Grasps that hold, in `FOLDER/data`."""
-    hands, made = " ".join(size.hands), f"{folder}/made_hands"
+    hands = " ".join(size.hands)
     known, validate = " ".join(size.known), " ".join(size.validate)
     usual, drawn, by_made, few = size.grasps
 
@@ -101,8 +109,7 @@ def data(size: Size, folder: str) -> list[Step]:
                     f"{size.labelled} {more}", free=AT_ONCE, share=share)
 
     steps = [
-        Step("made hands", f"dro-grasp hand make --seed {FIRST_MADE} --num {size.made} --output {made} --overwrite",
-             f"{made}/hands.csv"),
+        drawn_hands(size, folder),
         grasps("known", hands, f"{known} {validate}".strip(), usual, 0.2),
         grasps("fuller", hands, known, max(1, usual // 3), 0.1, "--idle 0.2 --seed 7"),
         grasps("procedural", hands, size.procedural, drawn, 0.25),
@@ -128,7 +135,7 @@ def labels(size: Size, folder: str) -> list[Step]:
 
 def weights(size: Size, folder: str) -> list[Step]:
     """The set of four weights, in `FOLDER/weights`, and where they ship; then what the scores are worth of guessed surfaces."""
-    grasps, own = f"{folder}/grasps", f"{folder}/weights"
+    grasps, own = size.learned.replace("{folder}", folder), f"{folder}/weights"
     bundle, validation, pretrained, trained, network, surface, quality, holding = (
         f"{own}/{name}.safetensors" for name in (
             "bundle", "validation", "pretrained", "trained", DEFAULT, *SMALL))
@@ -143,7 +150,7 @@ def weights(size: Size, folder: str) -> list[Step]:
     def packs(name: str, output: str, options: str) -> Step:
         return Step(name, f"dro-grasp dataset bundle {grasps} --output {output} {options}", output, (grasps,))
 
-    steps = [packs("bundle", bundle, f"--per-pair {size.per_pair}")]
+    steps = [drawn_hands(size, folder), packs("bundle", bundle, f"--per-pair {size.per_pair}")]
     if size.validate:
         steps.append(packs("validation", validation, "--split validate --per-pair 20"))
     return [
@@ -152,7 +159,7 @@ def weights(size: Size, folder: str) -> list[Step]:
         trains("training", f"train {size.training} --pretrained {pretrained} --validation {checked}", trained, pretrained,
                checked),
         trains("placement", f"train --part placement {size.placement} --initial {trained} --validation {checked}"
-               f"{' --validation-samples 10' if size is TINY else ''}", network, trained, checked, processes=False),
+               f"{'' if size.validate else ' --validation-samples 10'}", network, trained, checked, processes=False),
         Step("completion", f"python -m lab.recipe.completion --folder {{run}} --output {surface} {size.completion} {seed}",
              surface, free="--workers {workers}"),
         Step("ranking", f"python -m lab.recipe.ranking --folder {{run}} --weights {network} --surface {surface} "
@@ -161,8 +168,8 @@ def weights(size: Size, folder: str) -> list[Step]:
         Step("holding", f"python -m lab.recipe.holding --folder {{run}} --weights {network} --ranking {quality} "
              f"--output {holding} --hands {' '.join(size.hands)} {size.holding}", holding, (network, quality),
              "--workers {workers}"),
-        Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{' --changed' if size is TINY else ''}"),
-        *([] if size is TINY else [Step("guesses", "python -m lab.studies.seen_score --folder {run}",
+        Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{'' if size.into == PACKAGED else ' --changed'}"),
+        *([] if size.into != PACKAGED else [Step("guesses", "python -m lab.studies.seen_score --folder {run}",
                                         reads=(network, quality, holding, surface))]),
     ]
 

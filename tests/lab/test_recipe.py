@@ -71,6 +71,13 @@ def test_few_processes_with_all_cores_feed_a_device(
     assert (seen[0], seen[2]) == (threads, workers)
 
 
+def test_weights_are_made_of_the_grasps_that_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert recipe.main(["weights", "--grasps", "data/grasps", "--device", "cpu", "--workers", "1", "--list"]) == 0
+    hands, bundle, *_ = capsys.readouterr().out.splitlines()
+    assert hands.startswith("dro-grasp hand make ")  # some of these grasps are by hands that the recipe makes
+    assert bundle.startswith("dro-grasp dataset bundle data/grasps --output out/weights/bundle.safetensors ")
+
+
 def test_a_step_that_fails_ends_the_run_with_its_code_and_is_not_done(tmp_path: Path) -> None:
     step = attempt(tmp_path, "python -c 'raise SystemExit(3)'", tmp_path / "made")
     assert step.run() == 3
@@ -102,7 +109,7 @@ def test_weights_are_not_begun_with_uncommitted_code(
 @pytest.mark.parametrize("size", [FULL, TINY])
 def test_each_step_names_a_seed_or_draws_nothing(size) -> None:
     steps = [step for stage in STAGES.values() for step in stage(size, "out")]
-    assert len({step.name for step in steps}) == len(steps)
+    assert len({step.name for step in steps}) == len(set(steps))
     seeded = ("lab.recipe.holding", "lab.studies.seen_score")  # by a number of their own
     unseeded = ("dataset", "lab.benchmarks.data_card", "lab.recipe.pack", *seeded)
     for step in steps:

@@ -124,8 +124,9 @@ def _leaves(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
 
 def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]:
     """A grasp file's table and header; GraspFileError: it is missing, truncated, foreign, or of another version."""
+    path = _existing(path)
     with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
-        table = read_parquet(_existing(path))
+        table = read_parquet(path)
         header = read_header(path, table.schema)
         check_columns(table.schema, path)
     return table, header
@@ -139,9 +140,10 @@ def read_parquet(source: Path | io.BytesIO) -> pa.Table:
 
 def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
     """Number of grasps in a grasp file, and its header, from the footer alone; errors are those of `read_table`."""
-    with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
-        footer = pq.read_metadata(_existing(path))
-        return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
+    found = _existing(path)
+    with reading(found, GraspFileError, EXPECTED, pa.ArrowException):
+        footer = pq.read_metadata(found)
+        return footer.num_rows, read_header(found, footer.schema.to_arrow_schema())
 
 
 def _existing(path: Path | str | io.BytesIO) -> Path | io.BytesIO:
