@@ -26,7 +26,10 @@ from lab.recipe.parts import fill, fingerprint
 from lab.recipe.steps import FULL, STAGES, TINY, Step
 from tests.helpers.weights import untrained_weights
 
-RUN = [sys.executable, "-m", "lab.recipe", *STAGES, "--tiny", "--device", "cpu", "--workers", "2", "--folder"]
+
+def rehearse(stage: str, folder: Path) -> list[str]:
+    """The command that makes everything of a stage, small."""
+    return [sys.executable, "-m", "lab.recipe", stage, "--tiny", "--device", "cpu", "--workers", "2", "--folder", str(folder)]
 
 
 def attempt(folder: Path, command: str, makes: Path, *reads: Path, changed: bool = True) -> Attempt:
@@ -168,10 +171,10 @@ def test_weights_that_do_not_say_how_they_were_made_do_not_ship(tmp_path: Path, 
     assert not (tmp_path / "shipped").exists()
 
 
-def killed_in(step: str, folder: Path) -> bool:
-    """Start the recipe, and kill it a moment after a step has begun; whether the step ran."""
+def killed_in(stage: str, step: str, folder: Path) -> bool:
+    """Start a stage of the recipe, and kill it a moment after a step has begun; whether the step ran."""
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    run = subprocess.Popen([*RUN, str(folder)], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+    run = subprocess.Popen(rehearse(stage, folder), cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
     assert run.stdout is not None
     for line in run.stdout:
         if line.startswith(f"{step}: ") and "done before" not in line:
@@ -184,10 +187,11 @@ def killed_in(step: str, folder: Path) -> bool:
 
 @pytest.mark.slow
 def test_the_whole_recipe_survives_a_kill_in_each_step(tmp_path: Path) -> None:
-    steps = [step.name for stage in STAGES.values() for step in stage(TINY, str(tmp_path))]
-    assert [name for name in steps if not killed_in(name, tmp_path)] == []
-    done = subprocess.run([*RUN, str(tmp_path)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
+    for stage, steps in STAGES.items():
+        names = [step.name for step in steps(TINY, str(tmp_path)) if (stage, step.name) != ("weights", "made hands")]  # data's
+        assert [name for name in names if not killed_in(stage, name, tmp_path)] == []
+        done = subprocess.run(rehearse(stage, tmp_path), cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
     shipped = tmp_path / "weights" / "shipped"
     assert (shipped / CHECKSUMS).read_text().count("\n") == 4
     subprocess.run(["sha256sum", "--check", CHECKSUMS], cwd=shipped, check=True, capture_output=True)
