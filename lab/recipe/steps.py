@@ -58,13 +58,18 @@ class Size:
     into: str  # folder of the finished weights
     learned: str = "{folder}/grasps"  # folder of the grasps that weights are made of
 
+    @property
+    def ships(self) -> bool:
+        """Whether the finished weights replace those of the package."""
+        return self.into == PACKAGED
+
 
 FIRST_MADE = 100
 """Seed of the first made-up hand. Settings were chosen on hands of seeds below, and others are measured from 9000 on."""
 FULL = Size(
     hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
     validate=("assets:validate",), procedural="procedural:0-199 procedural:300-499", part="1/19", grasps=(60, 8, 12, 50),
-    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=75, per_pair=40,
+    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=40, per_pair=40,
     pretraining="--steps 6000 --motion-steps 10000",
     training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
     "--learning-rate 7e-4",
@@ -91,8 +96,8 @@ def made_hands(size: Size, folder: str) -> list[str]:
     return [f"{folder}/made_hands/hand_{seed:05d}.urdf" for seed in range(FIRST_MADE, FIRST_MADE + size.made)]
 
 
-def drawn_hands(size: Size, folder: str) -> Step:
-    """The step that makes them."""
+def make_hands(size: Size, folder: str) -> Step:
+    """The step that makes the made-up hands."""
     made = f"{folder}/made_hands"
     return Step("made hands", f"dro-grasp hand make --seed {FIRST_MADE} --num {size.made} --output {made} --overwrite",
                 f"{made}/hands.csv")
@@ -109,7 +114,7 @@ def data(size: Size, folder: str) -> list[Step]:
                     f"{size.labelled} {more}", free=AT_ONCE, share=share)
 
     steps = [
-        drawn_hands(size, folder),
+        make_hands(size, folder),
         grasps("known", hands, f"{known} {validate}".strip(), usual, 0.2),
         grasps("fuller", hands, known, max(1, usual // 3), 0.1, "--idle 0.2 --seed 7"),
         grasps("procedural", hands, size.procedural, drawn, 0.25),
@@ -150,7 +155,8 @@ def weights(size: Size, folder: str) -> list[Step]:
     def packs(name: str, output: str, options: str) -> Step:
         return Step(name, f"dro-grasp dataset bundle {grasps} --output {output} {options}", output, (grasps,))
 
-    steps = [drawn_hands(size, folder), packs("bundle", bundle, f"--per-pair {size.per_pair}")]
+    guesses = Step("guesses", "python -m lab.studies.seen_score --folder {run}", reads=(network, quality, holding, surface))
+    steps = [make_hands(size, folder), packs("bundle", bundle, f"--per-pair {size.per_pair}")]
     if size.validate:
         steps.append(packs("validation", validation, "--split validate --per-pair 20"))
     return [
@@ -168,9 +174,8 @@ def weights(size: Size, folder: str) -> list[Step]:
         Step("holding", f"python -m lab.recipe.holding --folder {{run}} --weights {network} --ranking {quality} "
              f"--output {holding} --hands {' '.join(size.hands)} {size.holding}", holding, (network, quality),
              "--workers {workers}"),
-        Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{'' if size.into == PACKAGED else ' --changed'}"),
-        *([] if size.into != PACKAGED else [Step("guesses", "python -m lab.studies.seen_score --folder {run}",
-                                        reads=(network, quality, holding, surface))]),
+        Step("set", f"python -m lab.recipe.pack {own} --into {size.into}{'' if size.ships else ' --changed'}"),
+        *([guesses] if size.ships else []),
     ]
 
 
