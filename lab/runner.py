@@ -157,13 +157,16 @@ def finished(jobs: list[Job], workers: int) -> Iterator[tuple[Job, str]]:
 
 
 def measure(job: Job, beside: bool) -> dict[str, Any]:
-    """Run a command and describe its state; with another beside it, each has one thread."""
+    """Run a command and describe its state; with another beside it, each has one thread.
+
+    Only results differ from the commit, as `main` refuses other changes.
+    """
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), **({"OMP_NUM_THREADS": "1"} if beside else {})}
     begin, load, day = time.perf_counter(), os.getloadavg()[0], datetime.datetime.now(datetime.UTC)
     done = subprocess.run(words(job.command), cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     where = {key: value for key, value in machine().items() if key != "commit"}
     return {
-        "command": job.command, "commit": commit() or "unknown", **job.state, "machine": where,
+        "command": job.command, "commit": commit().removesuffix("+") or "unknown", **job.state, "machine": where,
         "date": day.strftime("%Y-%m-%d"), "load": round(load, 1), "seconds": round(time.perf_counter() - begin, 1),
         "inputs": {name: file_hash(ROOT / PREPARED / name) for name in PREPARATIONS if f"{PREPARED}/{name}" in job.command
                    and (ROOT / PREPARED / name).is_file()},

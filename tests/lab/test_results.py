@@ -153,6 +153,11 @@ class TestRunner:
         assert runner.read("quick")["cells"]["one"]["result"] == {"number": 1}
         assert runner.main(["--stale"]) == 0
 
+    def test_results_that_are_not_committed_yet_do_not_mark_the_next_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(runner, "commit", lambda: "0123456789+")
+        runner.main([])
+        assert runner.read("quick")["cells"]["one"]["commit"] == "0123456789"
+
     def test_what_needs_a_folder_that_takes_hours_waits_for_it(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
