@@ -69,7 +69,7 @@ FIRST_MADE = 100
 FULL = Size(
     hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
     validate=("assets:validate",), procedural="procedural:0-199 procedural:300-499", part="1/19", grasps=(60, 8, 12, 50),
-    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=40, per_pair=40,
+    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=24, per_pair=40,
     pretraining="--steps 6000 --motion-steps 10000",
     training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
     "--learning-rate 7e-4",
