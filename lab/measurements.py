@@ -16,8 +16,10 @@ from lab.published_hands import HANDS as PUBLISHED
 
 PREPARED = "out/results"
 """Folder of what commands need and make once: `PREPARATIONS`."""
-LABELS = "out/labels"
-"""Folder that `make labels` fills in hours."""
+LABELS = "data/labels"
+"""Folder that `make labels` fills in hours, pair by pair; committed on the way, another machine goes on."""
+TRIED = 24
+"""Of a pair of hand and object, so many of the shipped grasps are tried as labels, whose palm directions differ most."""
 PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The hands of the paper."""
 UNSEEN_HANDS = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/ezgripper", "assets/orca")
@@ -54,6 +56,7 @@ CORE = ("devices.py", "frames.py", "kinds.py", "geometry", "network", "objects",
 PREPARATIONS = {
     "bundle.safetensors": "dro-grasp dataset bundle data/grasps --hands " + " ".join(PAPER_HANDS)
     + f" --output {PREPARED}/bundle.safetensors",
+    "tried": f"dro-grasp dataset merge data/grasps --output {PREPARED}/tried --per-pair {TRIED}",
     "made_hands": f"dro-grasp hand make --seed 9000 --num {MADE_HANDS} --output {PREPARED}/made_hands",
     "published": f"python -m lab.published_hands {PREPARED}/published",
 }
@@ -206,7 +209,7 @@ MEASUREMENTS = {
         "card": "python -m lab.benchmarks.data_card --json",
         "again": "python -m lab.benchmarks.dataset data/grasps --sample 60 --json"}, wings=("compare", "training")),
     "labels": Measurement("What `carry` and `robust` leave of these grasps, and of their diversity", {
-        "kept": f"python -m lab.benchmarks.data_card data/grasps --labels {LABELS} --json"}, wings=("compare", "training"),
+        "kept": f"python -m lab.benchmarks.data_card {PREPARED}/tried --labels {LABELS} --json"}, wings=("compare", "training"),
         needs=LABELS),
     "speed": Measurement("Times on the processor, nothing beside", {
         name: f"python -m lab.benchmarks.{name} {options}--json" for name, options in (

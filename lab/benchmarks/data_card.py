@@ -2,7 +2,7 @@
 
 Run it as `python -m lab.benchmarks.data_card [data/grasps] [--pictures docs/pictures] [--json]`.
 
-With `--labels out/labels` it tells instead what `dro-grasp dataset filter` keeps of these grasps in that folder, which
+With `--labels data/labels` it tells instead what `dro-grasp dataset filter` keeps of these grasps in that folder, which
 `make labels` fills, and what diversity that costs. Half of a run is a fair sample of the whole: counts and diversity are of
 the pairs that are done, before and after.
 """

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from dro_grasp.network.checkpoints import DEFAULT, SMALL
-from lab.measurements import UNSEEN_HANDS
+from lab.measurements import LABELS, TRIED
 from lab.recipe.ranking import HANDS
 
 PACKAGED = "src/dro_grasp/network/weights"
@@ -37,15 +37,16 @@ class Size:
     """How much of everything."""
 
     hands: tuple[str, ...]  # for training
-    held_out: tuple[str, ...]  # for few-shot data alone
     made: int  # made-up hands, from seed FIRST_MADE on
-    known: tuple[str, ...]  # objects that all training hands grasp
+    known: tuple[str, ...]  # objects that all training hands grasp anew
+    older: tuple[str, ...]  # training objects of the older grasps
     validate: tuple[str, ...]  # objects for measuring, which enter no training bundle
     procedural: str  # objects that seeds draw
-    part: str  # of the pairs of made-up hands and objects: a prime number, so that each hand gets other objects
-    grasps: tuple[int, int, int, int]
-    """Of a pair: of training hands, of those on procedural objects, of made-up hands, of held-out ones."""
-    labelled: str  # by which grasps are labels that hold
+    parts: tuple[str, str]
+    """Of the pairs of training hands and procedural objects, and of those of made-up hands and all objects; prime numbers, so
+    that each hand gets other objects."""
+    grasps: int  # of a pair
+    holds: str  # options by which a grasp is one that does
     shipped: str  # older grasps, which become labels by the filter
     most_shipped: int  # of a pair of these
     per_pair: int  # grasps in the training bundle
@@ -56,6 +57,8 @@ class Size:
     holding: str
     completion: str
     into: str  # folder of the finished weights
+    data: str = "{folder}/data"  # folder of new grasps
+    labels: str = "{folder}/labels"  # folder of older grasps that hold
     learned: str = "{folder}/grasps"  # folder of the grasps that weights are made of
 
     @property
@@ -67,9 +70,9 @@ class Size:
 FIRST_MADE = 100
 """Seed of the first made-up hand. Settings were chosen on hands of seeds below, and others are measured from 9000 on."""
 FULL = Size(
-    hands=HANDS, held_out=UNSEEN_HANDS, made=120, known=("assets:train", "builtin:train", "builtin:hard_train"),
-    validate=("assets:validate",), procedural="procedural:0-199 procedural:300-499", part="1/19", grasps=(60, 8, 12, 50),
-    labelled="--also robust --resettle", shipped="data/grasps", most_shipped=24, per_pair=40,
+    hands=HANDS, made=120, known=("builtin:train", "builtin:hard_train"), older=("assets:train",),
+    validate=("assets:validate",), procedural="procedural:0-199 procedural:300-499", parts=("1/7", "1/79"), grasps=6,
+    holds="--also robust --resettle", shipped="data/grasps", most_shipped=TRIED, per_pair=40,
     pretraining="--steps 6000 --motion-steps 10000",
     training="--steps 13000 --shards 2 --samples-per-hand 8 --by-count 0.5 --partial 0.25 --divergence 0.0005 "
     "--learning-rate 7e-4",
@@ -77,10 +80,11 @@ FULL = Size(
     ranking="--groups assets:train builtin:train builtin:hard_train procedural:0-199 --objects 16 --num 16 "
     "--trials carry robust",
     holding="--groups assets:train builtin:hard_train procedural:300-499 --made 64 --rounds 8 --num 32",
-    completion="--objects assets:train builtin:train procedural:0-199 --steps 12000", into=PACKAGED)
+    completion="--objects assets:train builtin:train procedural:0-199 --steps 12000", into=PACKAGED, data="data/synthesized",
+    labels=LABELS)
 TINY = Size(
-    hands=("gripper3",), held_out=(), made=2, known=("can", "torus"), validate=(), procedural="procedural:0-0",
-    part="1/2", grasps=(2, 1, 1, 0), labelled="", shipped="{folder}/data/known", most_shipped=6, per_pair=6,
+    hands=("gripper3",), made=2, known=("can", "torus"), older=(), validate=(), procedural="procedural:0-0",
+    parts=("1/1", "1/2"), grasps=2, holds="", shipped="{folder}/data/known", most_shipped=6, per_pair=6,
     pretraining="--preset slim --steps 4 --motion-steps 4",
     training="--preset slim --steps 8 --shards 2 --samples-per-hand 2 --validation-samples 10", placement="--steps 4",
     ranking="--groups can torus sphere --objects 2 --num 8 --trials carry --views half depth --steps 100",
@@ -104,36 +108,35 @@ def make_hands(size: Size, folder: str) -> Step:
 
 
 def data(size: Size, folder: str) -> list[Step]:
-    """Grasps that hold, in `FOLDER/data`."""
-    hands = " ".join(size.hands)
-    known, validate = " ".join(size.known), " ".join(size.validate)
-    usual, drawn, by_made, few = size.grasps
+    """Grasps that hold."""
+    made = size.data.replace("{folder}", folder)
+    hands, known, procedural = " ".join(size.hands), " ".join(size.known), size.procedural
+    everything = " ".join((*size.older, known, procedural))
+    of_training, of_made = size.parts
 
-    def grasps(name: str, of: str, on: str, each: int, share: float, more: str = "--seed 0") -> Step:
-        return Step(name, f"dro-grasp synthesize --hand {of} --object {on} --grasps {each} --output {folder}/data/{name} "
-                    f"{size.labelled} {more}", free=AT_ONCE, share=share)
+    def grasps(name: str, of: str, on: str, share: float, options: str, each: int = size.grasps) -> Step:
+        return Step(name, f"dro-grasp synthesize --hand {of} --object {on} --grasps {each} --output {made}/{name} "
+                    f"{size.holds} {options}", free=AT_ONCE, share=share)
 
-    steps = [
+    return [
         make_hands(size, folder),
-        grasps("known", hands, f"{known} {validate}".strip(), usual, 0.2),
-        grasps("fuller", hands, known, max(1, usual // 3), 0.1, "--idle 0.2 --seed 7"),
-        grasps("procedural", hands, size.procedural, drawn, 0.25),
-        grasps("made", " ".join(made_hands(size, folder)), f"{known} {size.procedural}", by_made, 0.4,
-               f"--seed 0 --shard {size.part}"),
+        grasps("known", hands, known, 0.3, "--seed 0"),
+        grasps("fuller", hands, known, 0.15, "--idle 0.2 --seed 7", each=size.grasps // 2),
+        grasps("procedural", hands, procedural, 0.25, f"--seed 0 --shard {of_training}"),
+        grasps("made", " ".join(made_hands(size, folder)), everything, 0.3, f"--seed 0 --shard {of_made}"),
     ]
-    if size.held_out:
-        steps.append(grasps("held_out", " ".join(size.held_out), f"assets:train {validate}", few, 0.05))
-    return steps
 
 
 def labels(size: Size, folder: str) -> list[Step]:
-    """Older grasps by the same measure, in `FOLDER/labels`, and all of them in one file a hand, in `FOLDER/grasps`."""
-    made = " ".join(f"{folder}/data/{step.name}" for step in data(size, folder) if step.share)
+    """Older grasps by the same measure, and all of them in one file a hand, in `FOLDER/grasps`."""
+    kept = size.labels.replace("{folder}", folder)
+    new = size.data.replace("{folder}", folder)
+    made = " ".join(f"{new}/{step.name}" for step in data(size, folder) if step.share)
     return [
         Step("shipped", f"dro-grasp dataset merge {size.shipped} --output {folder}/shipped --per-pair {size.most_shipped}"),
         Step("labels", f"dro-grasp dataset filter {folder}/shipped --protocol carry --also robust --resettle --again "
-             f"--output {folder}/labels", free="--workers {workers}"),
-        Step("grasps", f"dro-grasp dataset merge {made} {folder}/labels --output {folder}/grasps --per-pair 150"),
+             f"--output {kept}", free="--workers {workers}"),
+        Step("grasps", f"dro-grasp dataset merge {made} {kept} --output {folder}/grasps --per-pair 150"),
         Step("card", f"python -m lab.benchmarks.data_card {folder}/grasps"),
     ]
 
