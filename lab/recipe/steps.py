@@ -109,13 +109,12 @@ def make_hands(size: Size, folder: str) -> Step:
 
 def data(size: Size, folder: str) -> list[Step]:
     """Grasps that hold."""
-    made = size.data.replace("{folder}", folder)
     hands, known, procedural = " ".join(size.hands), " ".join(size.known), size.procedural
     everything = " ".join((*size.older, known, procedural))
     of_training, of_made = size.parts
 
     def grasps(name: str, of: str, on: str, share: float, options: str, each: int = size.grasps) -> Step:
-        return Step(name, f"dro-grasp synthesize --hand {of} --object {on} --grasps {each} --output {made}/{name} "
+        return Step(name, f"dro-grasp synthesize --hand {of} --object {on} --grasps {each} --output {size.data}/{name} "
                     f"{size.holds} {options}", free=AT_ONCE, share=share)
 
     return [
@@ -129,14 +128,12 @@ def data(size: Size, folder: str) -> list[Step]:
 
 def labels(size: Size, folder: str) -> list[Step]:
     """Older grasps by the same measure, and all of them in one file a hand, in `FOLDER/grasps`."""
-    kept = size.labels.replace("{folder}", folder)
-    new = size.data.replace("{folder}", folder)
-    made = " ".join(f"{new}/{step.name}" for step in data(size, folder) if step.share)
+    made = " ".join(f"{size.data}/{step.name}" for step in data(size, folder) if step.share)
     return [
         Step("shipped", f"dro-grasp dataset merge {size.shipped} --output {folder}/shipped --per-pair {size.most_shipped}"),
         Step("labels", f"dro-grasp dataset filter {folder}/shipped --protocol carry --also robust --resettle --again "
-             f"--output {kept}", free="--workers {workers}"),
-        Step("grasps", f"dro-grasp dataset merge {made} {kept} --output {folder}/grasps --per-pair 150"),
+             f"--output {size.labels}", free="--workers {workers}"),
+        Step("grasps", f"dro-grasp dataset merge {made} {size.labels} --output {folder}/grasps --per-pair 150"),
         Step("card", f"python -m lab.benchmarks.data_card {folder}/grasps"),
     ]
 

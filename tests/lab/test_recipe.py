@@ -18,6 +18,7 @@ from dro_grasp.network.checkpoints import CHECKSUMS, history_of, save_weights
 from dro_grasp.network.completion_network import SHIPPED as SHIPPED_SURFACE
 from dro_grasp.objects.catalogue import resolve_objects
 from dro_grasp.objects.perception.partial_views import View
+from dro_grasp.training.data.collections.collection import count_collection
 from dro_grasp.training.data.engine.schedule import own_pairs
 from lab.benchmarks.report import ROOT
 from lab.recipe import __main__ as recipe, pack, ranking
@@ -124,6 +125,8 @@ def test_the_data_are_what_a_release_asks_for() -> None:
     assert len(FULL.hands) == 10
     assert FULL.made >= 100
     assert {"assets:train", "builtin:train", "builtin:hard_train"} <= {*FULL.known, *FULL.older}
+    older = count_collection(ROOT / FULL.shipped)  # each training hand's, on the paper's 58 objects
+    assert {len(older[hand]) for hand in FULL.hands} == {58}
     drawn = resolve_objects(FULL.procedural.split())
     assert len(set(drawn)) >= 400
     # Settings are chosen on these: neither weights nor scores may know them.
