@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-full | data | labels | weights | rehearse | results | results-stale | tables | release-check | lint | docs | clean
+# make setup | demo | demo-arm | test | test-slow | test-full | data | labels | weights | rehearse | results | results-stale | tables | release-check | lint | docs | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-full results results-stale tables golden lint wheels release-check licences docs rehearse rehearse-bare docs-pictures data labels weights clean
+.PHONY: setup demo demo-arm test test-slow test-full results results-stale tables golden lint wheels release-check licences docs rehearse rehearse-bare docs-pictures data labels weights clean
 
 setup: $(STAMP)
 
@@ -28,9 +28,12 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
-test-full: setup  # every test, with shape checks: also what is slow, starts a browser or Ray, or builds the wheel
+test-slow: setup  # what is slow, starts a browser or Ray, or builds the wheel, with shape checks
 	CHECK_SHAPES=1 $(BIN)/python -m pytest -q -m alone
-	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'not gpu and not alone'
+	CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q -m 'slow and not gpu and not alone'
+
+test-full: test-slow  # every test, with shape checks
+	CHECK_SHAPES=1 $(MAKE) test
 
 NAMES :=
 results: setup  # measure what is missing or older than its code (NAMES="headline speed"; everything takes a night)

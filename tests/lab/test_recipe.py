@@ -138,7 +138,7 @@ def test_the_data_are_what_a_release_asks_for() -> None:
 
 def test_hands_share_all_objects_among_them() -> None:
     drawn = resolve_objects(FULL.procedural.split())
-    others = [*resolve_objects(FULL.known), *drawn]
+    others = [*resolve_objects(list(FULL.known)), *drawn]
     of_training, of_made = (tuple(map(int, part.split("/"))) for part in FULL.parts)
     made = [str(k) for k in range(FULL.made)]
     older = [f"asset {k}" for k in range(48)]  # the paper's training objects, where they are at hand

@@ -206,6 +206,13 @@ def test_reasons_come_from_the_process():
         cut_apart("coacd", box, 5.0, lambda _: None, nonsense=1)
 
 
+def test_a_process_whose_parent_ended_before_it_began_does_nothing(tmp_path: Path):
+    other = os.getppid()
+    words = [sys.executable, "-m", "dro_grasp.objects.cutting_process", str(other), "coacd", "no.npz", "parts.npz", "5"]
+    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 0  # it looks at no file
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_the_process_ends_with_the_one_that_started_it(tmp_path: Path):
     code = ("from tests.objects.test_convex_parts import bumpy\n"

@@ -57,7 +57,7 @@ def cut_apart(
 
 
 def _run(arguments: list[str], spent: Spent) -> None:
-    words = [sys.executable, "-P", "-m", "dro_grasp.objects.cutting_process", *arguments]
+    words = [sys.executable, "-P", "-m", "dro_grasp.objects.cutting_process", str(os.getpid()), *arguments]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
         process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import resource
 import signal
 import sys
@@ -15,9 +16,14 @@ from jaxtyping import Float, Int
 ENDS_WITH_PARENT = 1  # PR_SET_PDEATHSIG. Source: Linux's prctl(2)
 
 
-def main(method: str, source: str, target: str, seconds: str) -> None:
-    """Cut the mesh in one file by a method, and store the parts in another, within some seconds of computing."""
+def main(parent: str, method: str, source: str, target: str, seconds: str) -> None:
+    """Cut the mesh in one file by a method, and store the parts in another, within some seconds of computing.
+
+    It ends with the process that started it, whose number is `parent`.
+    """
     ctypes.CDLL(None).prctl(ENDS_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != int(parent):  # it ended while this one was starting
+        return
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Python's own handler waits until the library returns
     limit = math.ceil(float(seconds))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
