@@ -36,7 +36,10 @@ RIM_RADIUS = 0.12  # With a camera: radius of the neighbourhood that tells rim p
 TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
 RESTS = 0.002  # What ends no higher above the plane stands on it [m] (ours)
-HOLLOW = 0.35  # What ends higher than this share of its height above it is not known well enough to be made longer (ours)
+STEEP = 0.94
+"""Cosine between view and vertical above which a thing hides what is between it and the plane: 20 degrees (ours)."""
+HOLLOW = 0.35
+"""In other views, what ends higher than this share of its height above the plane may stand on something else (ours)."""
 
 
 def project(points: Float[np.ndarray, "n 3"], camera_distance: float | None) -> Float[np.ndarray, "n 2"]:
@@ -238,32 +241,36 @@ def complete_cloud(
     added = np.flatnonzero(~near)[: round(share * int((~near).sum()))]
     both, both_normals = np.concatenate([seen, surface[added]]), np.concatenate([seen_normals, outward[added]])
     whole = CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
-    return whole if table is None else stood(whole, table)
+    if table is None:
+        return whole
+    steep = side.table is not None and side.table[2] > STEEP * np.linalg.norm(table[:3])
+    return stood(whole, table, 1.0 if steep else HOLLOW)
 
 
-def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"]) -> CompletedCloud:
-    """The cloud with its unseen side down to the table, and not below it."""
+def stood(whole: CompletedCloud, table: Float[np.ndarray, "4"], most: float) -> CompletedCloud:
+    """The cloud with its unseen side down to the table, by `set_down`, and not below it."""
     kept = ~whole.added | (whole.points @ table[:3] > table[3])
     points, normals, added = (column[kept] for column in whole)
-    return CompletedCloud(*set_down(points, normals, added, table), added)
+    return CompletedCloud(*set_down(points, normals, added, table, most), added)
 
 
 def set_down(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], added: Bool[np.ndarray, " n"],
-    table: Float[np.ndarray, "4"],
+    table: Float[np.ndarray, "4"], most: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Points [m] and unit normals with an underside that reaches the plane below: what rests on a plane touches it.
 
-    From above, the underside of a lying thing is not seen, and is completed too high. The added points of the lower half are
-    moved down, in proportion to their depth; what was seen stays where it is.
+    From above, the underside of a lying thing is not seen, and is completed too high. The added points are moved down, in
+    proportion to their depth below the height from which on all is seen; what was seen stays where it is. What ends higher
+    above the plane than `most` of its own height stays too.
     """
     up = table[:3] / np.linalg.norm(table[:3])
     height = (points @ table[:3] - table[3]) / np.linalg.norm(table[:3])
-    gap, middle = float(height.min()), float(height.max()) / 2
-    if not RESTS < gap < HOLLOW * 2 * middle:
+    gap, rim = float(height.min()), float(np.quantile(height[added], 1 - STRAY)) if added.any() else 0.0
+    if not RESTS < gap < min(rim, most * float(height.max())):
         return points, normals
-    low, stretch = added & (height < middle), middle / (middle - gap)
-    down = np.where(low, (stretch - 1) * (middle - height), 0.0)
+    low, stretch = added & (height < rim), rim / (rim - gap)
+    down = np.where(low, (stretch - 1) * (rim - height), 0.0)
     # A surface that is stretched along one axis has normals that shrink along it.
     turned = normals + np.where(low, (1 / stretch - 1) * (normals @ up), 0.0)[:, None] * up
     return points - down[:, None] * up, turned / np.linalg.norm(turned, axis=1, keepdims=True)
