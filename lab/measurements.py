@@ -112,7 +112,7 @@ def _unseen() -> dict[str, str]:
         cells[f"{_short(hand)}, sources"] = _benchmark(
             "network optimiser", hand, OBJECTS["validate"], f"--num 16 --stages returned --protocols {FAST}")
         cells[f"{_short(hand)}, network alone"] = _benchmark(
-            "network", hand, OBJECTS["validate"], f"--num 12 --stages raw --protocols {FAST}")
+            "network", hand, OBJECTS["validate"], f"--num 12 --stages raw --protocols {FAST} dro")
     return cells
 
 

@@ -40,7 +40,7 @@ class Stage:
     learning_rate: float = 1e-3  # Peak of the learning rate.
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Time limit [min]; in `pretrain`, of each part. The learning rate follows steps or time, whichever is further on."""
-    shards: int = 1  # Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them.
+    shards: int = 1  # Independent parts of a step's batch; the processes of torchrun share them.
     tensorboard: Flag = False  # Also write the log for TensorBoard, which must be installed.
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
     """Where to compute: cpu, cuda, or cuda:1."""

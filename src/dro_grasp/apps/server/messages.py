@@ -199,7 +199,7 @@ class SentGrasp(Message):
     score: float
     """Log-odds of holding; higher is better."""
     origin: str
-    """`network` or `optimiser`."""
+    """Source that proposed it: `network`, `optimiser`, or `variation` of the best so far."""
     success: bool | None = None
     """Whether it held in its trial; null without one."""
     reason: str | None = None
