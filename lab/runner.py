@@ -148,7 +148,7 @@ def finished(jobs: list[Job], workers: int) -> Iterator[tuple[Job, str]]:
                     job, error = waiting.pop(future), ""
                     try:
                         keep(job, future.result())
-                    except (subprocess.CalledProcessError, ValueError) as problem:
+                    except (subprocess.CalledProcessError, ValueError, IndexError) as problem:  # IndexError: it printed nothing
                         error = "\n".join((getattr(problem, "stderr", "") or str(problem)).splitlines()[-LINES:])
                     yield job, error or ""
         except BaseException:
@@ -163,10 +163,11 @@ def measure(job: Job, beside: bool) -> dict[str, Any]:
     """
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), **({"OMP_NUM_THREADS": "1"} if beside else {})}
     begin, load, day = time.perf_counter(), os.getloadavg()[0], datetime.datetime.now(datetime.UTC)
+    state = commit().removesuffix("+") or "unknown"  # while it runs, another may come
     done = subprocess.run(words(job.command), cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     where = {key: value for key, value in machine().items() if key != "commit"}
     return {
-        "command": job.command, "commit": commit().removesuffix("+") or "unknown", **job.state, "machine": where,
+        "command": job.command, "commit": state, **job.state, "machine": where,
         "date": day.strftime("%Y-%m-%d"), "load": round(load, 1), "seconds": round(time.perf_counter() - begin, 1),
         "inputs": {name: file_hash(ROOT / PREPARED / name) for name in PREPARATIONS if f"{PREPARED}/{name}" in job.command
                    and (ROOT / PREPARED / name).is_file()},

@@ -109,6 +109,17 @@ def test_a_file_in_the_home_folder_is_replaced(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "new.txt").read_text() == "new"
 
 
+def test_of_a_link_the_target_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link.txt").symlink_to("there/file.txt")
+    for content in ("first", "second"):
+        with replacing(tmp_path / "link.txt") as temporary:
+            temporary.write_text(content)
+        assert (tmp_path / "there" / "file.txt").read_text() == content
+        assert (tmp_path / "link.txt").is_symlink()
+    assert [file.name for file in (tmp_path / "there").iterdir()] == ["file.txt"]
+
+
 def test_our_own_errors_and_ctrl_c_pass() -> None:
     for error in (OptionError("mine"), KeyboardInterrupt()):
         with pytest.raises(type(error)), reading("f", GraspFileError, "a file"):

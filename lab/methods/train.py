@@ -17,7 +17,7 @@ from dro_grasp.files import check_output
 from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.data.bundle.training_file import load_bundle
-from dro_grasp.training.runs import check_schedule, is_first, last_logged
+from dro_grasp.training.runs import check_schedule, how_long, is_first
 from lab.methods.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
 from lab.methods.manifm.contact_training import ContactTrainingConfig, train_contacts
 
@@ -47,9 +47,8 @@ def train(
     model = (train_contact_maps if method == "gendexgrasp" else train_contacts)(data, config, run_folder)
     if not is_first():
         return
-    last = last_logged(run_folder)
     save_weights(model, output, {
-        "steps": int(last["step"]), "seconds": round(last["seconds"]), "stage": method, "data": data.summary(),
+        **how_long(run_folder), "stage": method, "data": data.summary(),
         "settings": dataclasses.asdict(config)})
 
 

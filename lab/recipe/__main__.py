@@ -53,6 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--grasps", help="of these `weights` are made, instead of what `labels` made in the folder")
     parser.add_argument("--list", action="store_true", help="only print the commands")
     options = parser.parse_args(argv)
+    for path in (options.folder, options.grasps or ""):
+        if path and shlex.quote(path) != path:
+            parser.error(f"'{path}' has a space or another character that a command line takes apart; name another folder")
     device = choose_device(options.device)
     if "weights" in options.stages and not (options.tiny or options.list) and commit().endswith("+"):
         print("weights state the commit of the code that makes them; commit your changes first, and leave the code as it is "

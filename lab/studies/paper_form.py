@@ -38,7 +38,7 @@ from dro_grasp.training.data.bundle.training_file import Bundle, load_bundle
 from dro_grasp.training.loop import train
 from dro_grasp.training.measures import distance_errors
 from dro_grasp.training.pretraining import pretrain
-from dro_grasp.training.runs import last_logged
+from dro_grasp.training.runs import how_long
 from lab.benchmarks.report import emit, options_of
 from lab.benchmarks.synthesis import HANDS
 
@@ -90,12 +90,12 @@ def trained(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) ->
         before = PretrainConfig(dataclasses.replace(schedule, steps=options.pretraining_steps))
         place = folder / f"{options.preset}_pretraining_{seed}"
         first = pretrain(bundle, network, before, place)
-        seconds = last_logged(place)["seconds"]
+        seconds = how_long(place)["seconds"]
     config = TrainConfig(schedule, form.losses)
     model = train(bundle, network, config, folder / path.stem, first, name=path.stem)
     about = {
         "stage": "training", "pretrained": form.pretrained, "steps": options.steps, "data": bundle.summary(),
-        "seconds": seconds + last_logged(folder / path.stem)["seconds"], "settings": dataclasses.asdict(config),
+        "seconds": seconds + how_long(folder / path.stem)["seconds"], "settings": dataclasses.asdict(config),
     }
     save_weights(model, path, about)
     return path

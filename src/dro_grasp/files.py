@@ -187,17 +187,18 @@ def make_folder(path: Path | str) -> Path:
 def replacing(path: Path | str, what: str = "") -> Iterator[Path]:
     """A temporary path that replaces `path` when the block ends.
 
-    A failure leaves `path` as it was; its OutputError names `what`.
+    A failure leaves `path` as it was; its OutputError names `what`. Of a link, the target is replaced.
     """
     path, temporary = given_path(path), None
     try:
-        unused = path.absolute().parent / f".{path.name}{secrets.token_hex(4)}.part"
+        place = Path(os.path.realpath(path))
+        unused = place.parent / f".{place.name}{secrets.token_hex(4)}.part"
         handle = os.open(unused, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)  # less what the user's umask takes
         temporary, mode = unused, os.fstat(handle).st_mode
         os.close(handle)
         yield temporary
         os.chmod(temporary, mode)  # a library may have put a new file there
-        os.replace(temporary, path)
+        os.replace(temporary, place)
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
         target = f"{what} to {path}" if what else path

@@ -10,6 +10,7 @@ import torch
 
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.grasp_file import read_footer
+from dro_grasp.hands.library import BUILTIN_FOLDER
 from tests.helpers.loaded_hands import loaded_hand
 
 
@@ -72,3 +73,31 @@ def test_two_hands_without_names_in_the_file_are_refused(
 ) -> None:
     assert imported(theirs, "--hands", "barrett", "gripper3", "--output", str(tmp_path / "out")) == 2
     assert "--hands names barrett and gripper3 for all hands of the files" in capsys.readouterr().err
+
+
+def of_two_hands(folder: Path) -> str:
+    """A grasp of each of two hands, of a ball."""
+    q = torch.cat([torch.zeros(6), loaded_hand("gripper3").canonical_joints()])
+    torch.save({"metadata": [(q, "sphere", name) for name in ("left", "right")]}, folder / "two.pt")
+    return str(folder / "two.pt")
+
+
+def test_two_hands_whose_files_have_one_name_do_not_replace_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        (tmp_path / side / "mine.urdf").write_text((BUILTIN_FOLDER / "gripper3.urdf").read_text() + f"<!-- {side} -->")
+    hands = [f"{side}={tmp_path / side / 'mine.urdf'}" for side in ("left", "right")]
+    assert imported(of_two_hands(tmp_path), "--hands", *hands, "--output", str(tmp_path / "out")) == 2
+    assert "are both called 'mine'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_file_under_two_paths_is_one_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.urdf").write_text((BUILTIN_FOLDER / "gripper3.urdf").read_text())
+    hands = [f"left={tmp_path / 'mine.urdf'}", f"right={tmp_path}/../{tmp_path.name}/mine.urdf"]
+    output = ["--output", str(tmp_path / "out"), "--json"]
+    assert imported(of_two_hands(tmp_path), "--hands", *hands, *output) == 0
+    (file,), _ = json.loads(capsys.readouterr().out).values()
+    assert (file["hand"], file["grasps"]) == ("mine", 2)

@@ -67,3 +67,14 @@ def test_what_was_asked_for_in_vain_stays_in_the_file(tmp_path: Path, capsys: py
     for file, *more in ((path, "--output", str(tried)), (tried,)):
         assert main(["evaluate", str(file), "--json", *more]) == 0
         assert json.loads(capsys.readouterr().out)["asked"] == 6
+
+
+def test_an_output_in_the_folder_that_is_evaluated_is_refused(
+    generate, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "made").mkdir()
+    generate("--output", str(tmp_path / "made" / "a.parquet"), "--protocol", "none", num=1)
+    assert main(["evaluate", str(tmp_path / "made"), "--output", str(tmp_path / "made" / "all.parquet")]) == 2
+    assert "would be read twice from then on" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path / "made"), "--output", str(tmp_path / "all.parquet")]) == 0
+    assert len(GraspBatch.load(tmp_path / "all.parquet")) == 1

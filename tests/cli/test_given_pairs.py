@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.cli.main import main, parse
+from dro_grasp.cli.view import View
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
@@ -124,3 +128,16 @@ def test_an_object_without_success_does_not_get_the_grasps_of_another(
     for more in ([], ["--object", "can"]):
         drawn = parse([*command, *more]).pairs(load_grasps("both.parquet"))
         assert [(obj.name, len(own)) for obj, own in drawn] == [("can", 1)]
+
+
+def test_the_viewer_shows_the_object_of_a_file_in_the_scale_that_is_given(
+    generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, shown = tmp_path / "grasps.parquet", list[Any]()
+    generate("--output", str(path), "--protocol", "none", num=1)
+    monkeypatch.setattr(View, "_pages", lambda _, fill: fill)
+    for scale in ([], ["--scale", "1.2"]):
+        fill: Any = parse(["view", str(path), "--object", "sphere", *scale])._opened(path)
+        fill(SimpleNamespace(open=lambda *given: shown.append(given[2])))
+    assert shown[0] is None, "the file's own"
+    assert np.ptp(shown[1].vertices) == pytest.approx(1.2 * np.ptp(load_object("sphere").vertices))

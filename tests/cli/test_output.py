@@ -9,7 +9,7 @@ import torch
 from scipy.special import expit
 
 from dro_grasp.cli.main import main
-from dro_grasp.cli.output import print_table, say, say_file
+from dro_grasp.cli.output import print_table, say, say_aside, say_file
 from dro_grasp.grasps.batch import percent
 from dro_grasp.network.checkpoints import SMALL, weights_names
 from dro_grasp.training.data.collections.report import LABEL, short_names
@@ -91,6 +91,17 @@ def test_labels_of_joints_differ() -> None:
     long = [f"{i}_the_same_long_ending" for i in range(3)]
     assert short_names(long) == long, "not cut where two would be the same"
     assert short_names(["only_one"]) == ["only_one"]
+    assert short_names(["/hand/thumb", "/hand/index"]) == ["thumb", "index"]
+    assert short_names(["robot0:THJ1", "robot0:FFJ1"]) == ["THJ1", "FFJ1"]
+    assert short_names(["/hand/thumb", "index"]) == ["/hand/thumb", "index"]
+    assert short_names(["hand/j1/yaw", "hand/j1/roll", "hand/j2/yaw"]) == ["j1/yaw", "j1/roll", "j2/yaw"]
+
+
+def test_colons_in_names_are_no_pictures(capsys: pytest.CaptureFixture[str]) -> None:
+    say("out/run:fire:1.parquet")
+    say_aside("out/run:fire:2.parquet")
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("out/run:fire:1.parquet\n", "out/run:fire:2.parquet\n")
 
 
 @pytest.mark.parametrize("command", [

@@ -181,3 +181,24 @@ def test_asking_a_server_loads_nothing_heavy(server: str, tmp_path: Path) -> Non
                           env=os.environ | {"DRO_GRASP_SERVER": server})
     assert done.stdout.splitlines()[-1] == "0 []", done.stderr
     assert len(GraspBatch.load(output)) == 1
+
+
+class Foreign(Page):
+    """Another program, which answers anything."""
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b'{"report": {}}')
+
+
+def test_another_program_at_the_address_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with HTTPServer(("127.0.0.1", 0), Foreign) as server:
+        threading.Thread(target=server.serve_forever, args=[0.01], daemon=True).start()
+        output = tmp_path / "grasps.parquet"
+        assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--output", str(output),
+                     "--server", f"http://127.0.0.1:{server.server_port}"]) == 2
+        server.shutdown()
+    assert "answers, but not as a grasp server of version" in capsys.readouterr().err
+    assert not output.exists()

@@ -13,6 +13,7 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp import extras
+from dro_grasp.arm.tabletop import animation
 from dro_grasp.arm.tabletop.attempts import Attempt
 from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.cli.main import parse
@@ -133,3 +134,23 @@ def test_without_the_extra_it_says_what_to_install(
     with pytest.raises(dro.DroGraspError, match=re.escape("pip install '.[arm]' in the folder of the clone")):
         lifted()
     assert not done
+
+
+def test_the_first_attempt_that_moved_is_drawn_and_none_is_no_error(
+    lifted: Lift, done: list[Attempt], small_robot: str, weights: str, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = list[tuple[str, int]]()
+    monkeypatch.setattr(animation, "draw_attempt", lambda run, chosen, path: drawn.append((chosen.object_file, chosen.number)))
+    stage = {("can", 0): "plan", ("can", 1): "see", ("cube", 0): "lift", ("cube", 1): "done"}
+
+    def attempt(robot: Any, obj: Any, number: int, seed: int, *others: Any) -> Attempt:
+        return Attempt(robot.name, obj.name, number, seed, others[1].label(), stage=stage[obj.name, number])
+
+    common = ["tabletop", "--robot", small_robot, "--objects", "can", "cube", "--attempts", "2", "--weights", weights]
+    assert parse([*common, "--video", "film.webp"]).run(attempt) == 0
+    assert drawn == [("cube", 0)]
+    stage |= {("cube", 0): "see", ("cube", 1): "plan"}
+    assert parse([*common, "--video", "film.webp"]).run(attempt) == 0
+    assert "no robot moved in any attempt, so film.webp is not drawn" in capsys.readouterr().err
+    assert len(drawn) == 1

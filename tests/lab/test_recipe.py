@@ -82,6 +82,13 @@ def test_weights_are_made_of_the_grasps_that_are_named(capsys: pytest.CaptureFix
     assert bundle.startswith("dro-grasp dataset bundle data/grasps --output out/weights/bundle.safetensors ")
 
 
+def test_a_folder_that_a_command_line_takes_apart_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for options in (["--folder", "my out"], ["--grasps", "my grasps"]):
+        with pytest.raises(SystemExit):
+            recipe.main(["weights", *options, "--list"])
+        assert f"'{options[1]}' has a space" in capsys.readouterr().err
+
+
 def test_a_step_that_fails_ends_the_run_with_its_code_and_is_not_done(tmp_path: Path) -> None:
     step = attempt(tmp_path, "python -c 'raise SystemExit(3)'", tmp_path / "made")
     assert step.run() == 3

@@ -189,6 +189,27 @@ class TestRunner:
         assert "no" in capsys.readouterr().out
         assert not (runner.RESULTS / "quick.json").exists()
 
+    def test_a_command_that_prints_nothing_is_told_and_the_others_are_run(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        cells = {"one": "python -c pass", "two": "python -c 'print(2)'"}
+        monkeypatch.setattr(runner, "MEASUREMENTS", {"quick": Measurement("Silence", cells, ())})
+        assert runner.main(["--workers", "1"]) == 1
+        assert "quick: two: done" in capsys.readouterr().out
+        assert list(runner.read("quick")["cells"]) == ["two"]
+
+    def test_a_result_is_of_the_commit_at_which_it_began(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        honest = runner.subprocess.run
+
+        def run(*given: object, **options: object) -> object:
+            monkeypatch.setattr(runner, "commit", lambda: "later")
+            return honest(*given, **options)
+
+        monkeypatch.setattr(runner, "commit", lambda: "begun")
+        monkeypatch.setattr(runner.subprocess, "run", run)
+        runner.main([])
+        assert runner.read("quick")["cells"]["one"]["commit"] == "begun"
+
     def test_nothing_is_measured_with_uncommitted_changes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(runner, "uncommitted", lambda: ["src/dro_grasp/kinds.py"])
         with pytest.raises(SystemExit):

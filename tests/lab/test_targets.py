@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lab import targets
-from lab.measurements import MEASUREMENTS
+from lab.measurements import MEASUREMENTS, ROBOTS
 from lab.reading import Results
 from lab.targets import Found, Target
 
@@ -90,3 +90,15 @@ def test_half_of_the_candidates_loses_the_most_on_one_group(tmp_path: Path, monk
     found = targets.lost_by_half(Results(tmp_path))
     assert found.value == pytest.approx(4)
     assert found.told == "4.0 points: 76.0 instead of 80.0 %, hard"
+
+
+def test_tables_that_one_robot_cleared_are_not_those_of_both(tmp_path: Path) -> None:
+    declared = MEASUREMENTS["cleared"].cells
+    for robots, end in ((ROBOTS[:1], "not measured"), (ROBOTS, "reached")):
+        cells = {name: {**CELL, "command": declared[name], "result": {"removed": 6, "things": 6, "picks": 6}}
+                 for robot in robots for name in declared if name.startswith(robot)}
+        folder = tmp_path / str(len(robots))
+        folder.mkdir()
+        (folder / "cleared.json").write_text(json.dumps({"cells": cells}))
+        lines = {t.what: t.line(Results(folder)) for t in targets.targets()}
+        assert [lines[what][5] for what in ("things cleared, six on a table", "picks for each")] == [end, end]

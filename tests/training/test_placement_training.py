@@ -84,10 +84,19 @@ def test_the_command_trains_the_placement_alone(
     assert main(command) == 2
     assert main([*command, "--initial", str(first), "--pretrained", str(first)]) == 2
     assert capsys.readouterr().err.count("name them with --initial") == 2
+    assert main([*command, "--initial", str(first), "--preset", "slim"]) == 2
+    assert "decides the form of the network, and --preset slim states one, too" in capsys.readouterr().err
+    whole = [word for word in command if word not in ("--part", "placement")]
+    assert main([*whole, "--initial", str(first), "--pretrained", str(first)]) == 2
+    assert "both give the hand encoder" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
     assert main([*command, "--initial", str(first)]) == 0
     assert load_weights(output).config == TINY
     about = describe_weights(output)
     assert (about["about"]["stage"], about["about"]["steps"]) == ("placement", 3)
     assert about["history"] == [{"stage": "training"}]
+    (tmp_path / "run" / "log.jsonl").unlink()  # what is kept of a run is its checkpoint
+    output.unlink()
+    assert main([*command, "--initial", str(first)]) == 0
+    assert describe_weights(output)["about"]["steps"] == 3
 

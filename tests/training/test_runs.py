@@ -36,6 +36,7 @@ from dro_grasp.training.runs import (
     TrainingRun,
     check_schedule,
     console_report,
+    how_long,
     learning_rate_share,
     run_plan,
 )
@@ -135,6 +136,17 @@ def test_a_gradient_that_is_not_finite_stops(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match=r"^gradient is not finite at step 0"):
         run.train(lambda: {"total": (model.weight * 0).sqrt().sum()}, quiet)
     assert all(torch.equal(before[k], v) for k, v in model.state_dict().items())
+
+
+def test_a_run_folder_in_the_home_folder_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    model = nn.Linear(1, 1)
+    run = TrainingRun(Path("~/run"), model, dataclasses.replace(SCHEDULE, steps=1), torch.Generator())
+    run.train(lambda: {"total": model(torch.ones(1)).square().sum()}, quiet)
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
+    assert how_long(Path("~/run"))["steps"] == 1
+    assert (tmp_path / "home" / "run" / CHECKPOINT).is_file()
 
 
 def damage(path: Path, how: str) -> None:

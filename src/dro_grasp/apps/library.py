@@ -152,7 +152,8 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
     found = sorted((p for p in folder.rglob("*") if p.suffix.lower() in DESCRIPTIONS), key=lambda p: (len(p.parts), p))
     urdf = [p for p in found if p.suffix.lower() == ".urdf"]
     if not found:
-        raise OptionError(f"{plain} holds no URDF or MJCF file; pack the description together with its meshes")
+        raise OptionError(f"{plain} holds no URDF or MJCF file; pack a hand's description together with its meshes, and send "
+                          "an object or a scene as one file that is not packed")
     return (urdf or found)[0]
 
 

@@ -127,7 +127,7 @@ class Clear:
         from dro_grasp.arm.tabletop.animation import draw_animation
 
         if self.record is not None:
-            recorder.record(robot, self.robot).save(self.record)
+            recorder.record(robot).save(self.record)
             say_aside(f"record: {self.record} (dro-grasp view {self.record} plays it)")
         if self.video is not None:
             draw_animation(robot, replace(recorder, frames=recorder.frames[::VIDEO_EVERY]), self.video)

@@ -12,7 +12,7 @@ import tyro
 from dro_grasp.cli.inputs import Flag, Mass, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
 from dro_grasp.errors import ObjectError, OptionError
-from dro_grasp.files import check_output
+from dro_grasp.files import check_output, given_path
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
 if TYPE_CHECKING:
@@ -61,7 +61,10 @@ class Evaluate:
 
         rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
-            check_output(self.output, ".parquet")
+            folder = check_output(self.output, ".parquet").resolve().parent
+            if folder == given_path(self.file).resolve():
+                raise OptionError(f"--output {self.output} is in the folder whose grasps are evaluated, where they would be "
+                                  "read twice from then on; name a file in another folder")
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)

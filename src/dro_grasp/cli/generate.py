@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from dro_grasp.errors import DroGraspError
     from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand

@@ -63,11 +63,11 @@ class Make:
             for seed, file in zip(seeds, files, strict=True):
                 made.append(make_hand(seed))
                 with replacing(file) as temporary:
-                    temporary.write_text(made[-1].urdf)
+                    temporary.write_text(made[-1].urdf, encoding="utf-8")
                 if progress is not None:
                     progress(len(made), self.num)
         listing |= {hand.name: hand.facts() for hand in made}
-        with replacing(folder / LISTING) as temporary, temporary.open("w", newline="") as file:
+        with replacing(folder / LISTING) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(made[0].facts()), extrasaction="ignore")
             writer.writeheader()
             writer.writerows(listing[name] for name in sorted(listing))
@@ -95,7 +95,7 @@ def _listing(path: Path) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     with reading(path, OutputError, "the listing of a folder of made hands; name another folder", KeyError), \
-            path.open(newline="") as file:
+            path.open(newline="", encoding="utf-8") as file:
         return {row["name"]: row for row in csv.DictReader(file)}
 
 
@@ -136,7 +136,7 @@ class Vary:
             raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")
         text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
         with replacing(path) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(text, encoding="utf-8")
         if self.json:
             print_json({"hand": self.hand, "mirrored": self.mirrored, "scale": self.scale, "output": str(self.output)})
         else:

@@ -20,9 +20,9 @@ from dro_grasp.files import check_folder
 if TYPE_CHECKING:
     from dro_grasp.hands.description.loader import Description
 
-stdout = Console(highlight=False, markup=False)
-stderr = Console(stderr=True, highlight=False, markup=False)
-endless = Console(highlight=False, markup=False, width=10_000)  # for tables in files and pipes, whose lines have no end
+stdout = Console(highlight=False, markup=False, emoji=False)
+stderr = Console(stderr=True, highlight=False, markup=False, emoji=False)
+endless = Console(highlight=False, markup=False, emoji=False, width=10_000)  # for tables in files and pipes: endless lines
 
 
 NOTHING = ("", "-")  # Cells without a value

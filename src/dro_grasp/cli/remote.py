@@ -12,6 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dro_grasp._version import __version__
 from dro_grasp.cli.output import print_json, progress_bar, say_aside
 from dro_grasp.cli.switches import in_switches
 from dro_grasp.errors import OptionError, ServerError
@@ -27,6 +28,7 @@ OWN = ("weights", "device")  # Options that are the server's own
 SHOWN = ("picture", "view")  # Options that need the hand and the object here
 SCENE = ("scene", "at", "pixel", "mask", "nearest", "part", "scene_picture")  # Options of scenes, which are taken apart here
 SOURCES = ("auto", "network", "optimiser")  # What proposes candidates at a server, which runs no code of others
+ANSWERED = {"warnings", "report", "seconds", "kept", "rows", "lines", "file"}  # What an answer to `POST /generate` holds
 FAULT = 500  # Status of HTTP after a fault of dro-grasp
 
 
@@ -112,7 +114,7 @@ def sent_camera(path: Path) -> dict[str, Any]:
     key, path = "T_frame_camera", given_path(path)
     wanted = f'a file with {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
     with reading(path, OptionError, wanted, *UNTYPED):
-        values = json.loads(path.read_text())
+        values = json.loads(path.read_text(encoding="utf-8"))
         rows = [[struct.unpack("f", struct.pack("f", number))[0] for number in row] for row in values[key]]
         require_known(values, FRAME_FILE, path)
         return {"frame": values["frame"], key: rows}
@@ -123,7 +125,11 @@ def _answered(address: str, call: dict[str, Any]) -> dict[str, Any]:
     from dro_grasp.cli.view import TOKEN
 
     try:
-        return GraspClient(address, os.environ.get(TOKEN), TIMEOUT).ask("POST", "/generate", call)
+        answer = GraspClient(address, os.environ.get(TOKEN), TIMEOUT).ask("POST", "/generate", call)
+        if not isinstance(answer, dict) or not ANSWERED <= answer.keys():
+            raise ServerError(f"{address} answers, but not as a grasp server of version {__version__}; start one with "
+                              f"`dro-grasp serve`, or compute here (--server {HERE})")
+        return answer
     except ServerError as error:
         if error.status == FAULT:  # the command tells a fault of dro-grasp as such, wherever it is
             raise RuntimeError(str(error)) from error

@@ -73,8 +73,7 @@ class Plan:
     top: int = 5  # Best reachable grasps that the planner gets at once.
     rehearsals: int = 8
     """Grasps whose lift is simulated, on the object as it is known, whenever there are new ones; 0 for none."""
-    friction: Annotated[float, tyro.conf.arg(metavar="MU")] = 0.5
-    """Friction between hand, object and table, in simulated lifts."""
+    friction: Friction = 0.5
     directions: Literal["paper", "all"] = "all"
     """Palm directions. paper: from above to the right side. all: every direction for which the table leaves room."""
     least_confidence: Annotated[float | None, optional("P", "0.2 with --rehearsals 0, else 0.12")] = None
@@ -293,7 +292,11 @@ class Tabletop:
             say_aside(f"{len(done) - len(made)} of {len(done)} attempts are in --output already, and --plans gets none of them")
         self._report(done)
         if self.video is not None:
-            draw_attempt(run, self.video)
+            moved = next((each for each in done if each.moved), None)
+            if moved is None:
+                say_aside(f"warning: no robot moved in any attempt, so {self.video} is not drawn")
+                return 0
+            draw_attempt(run, moved, self.video)
             say_file("video", self.video, aside=True)
         return 0
 

@@ -48,11 +48,13 @@ class Stage:
     json: Flag = False  # Print one JSON object at the end.
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
-        """The configuration of the preset, else of the initial weights, else of `multi`."""
+        """The configuration of the initial weights, or else of the preset; OptionError: both are given."""
         from dro_grasp.network.presets import NetworkConfig
 
-        given = None if initial is None or self.preset is not None else initial.config
-        return given or NetworkConfig.preset(self.preset or "multi")
+        if initial is not None and self.preset is not None:
+            raise OptionError(f"--initial {self.initial} decides the form of the network, and --preset {self.preset} states "
+                              "one, too; leave one of them out")
+        return NetworkConfig.preset(self.preset or "multi") if initial is None else initial.config
 
     def schedule(self, **more: Any) -> ScheduleConfig:
         """The schedule, which can be carried out here."""
@@ -90,7 +92,7 @@ class Pretrain(Stage):
         from dro_grasp.training.data.bundle.training_file import load_bundle
         from dro_grasp.training.measures import matching_rank
         from dro_grasp.training.pretraining import pretrain, pretrain_motion
-        from dro_grasp.training.runs import is_first
+        from dro_grasp.training.runs import how_long, is_first
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output, ".safetensors")
@@ -164,13 +166,16 @@ class Train(Stage):
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
         from dro_grasp.training.data.bundle.training_file import load_bundle
         from dro_grasp.training.loop import train, train_placement
-        from dro_grasp.training.runs import is_first
+        from dro_grasp.training.runs import how_long, is_first
 
         check_output(self.output, ".safetensors")
         require_positive(validation_samples=self.validation_samples)
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
             raise OptionError("--part placement trains the placement prior of given weights further: name them with --initial, "
                               "and leave out --pretrained")
+        if self.initial is not None and self.pretrained is not None:
+            raise OptionError(f"--initial {self.initial} and --pretrained {self.pretrained} both give the hand encoder; leave "
+                              "one of them out")
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = self.network(initial)
@@ -228,11 +233,3 @@ class Train(Stage):
         metrics = {"distance_errors": [asdict(error) for error in errors], "validation": validation.fingerprint}
         save_weights(model, self.output, about | {"metrics": metrics}, history)
         return errors
-
-
-def how_long(run_folder: Path) -> dict[str, int]:
-    """Steps and seconds that a run took."""
-    from dro_grasp.training.runs import last_logged
-
-    last = last_logged(run_folder)
-    return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

@@ -158,7 +158,7 @@ class View:
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
         obj, chosen = of_object(grasps, self.object, self.scale)
-        given = self.object is not None and self.object not in dict(grasps.by_object())
+        given = self.object is not None and (self.scale is not None or self.object not in dict(grasps.by_object()))
         return self._pages(lambda studio: studio.open(
             hand, chosen if given else grasps, obj if given else None, self.object))
 

@@ -27,7 +27,7 @@ def write_page(path: Path, title: str, body: str) -> None:
     """Write a page of an HTML body, whose window has the title."""
     with replacing(path) as temporary:
         temporary.write_text(f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"
-                             f"{body}<p class=note>dro-grasp {__version__}</p>")
+                             f"{body}<p class=note>dro-grasp {__version__}</p>", encoding="utf-8")
 
 
 @dataclass(frozen=True)

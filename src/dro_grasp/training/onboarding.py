@@ -205,7 +205,7 @@ class _Onboarding:
     def _known(self, state: Path) -> dict[str, Any] | None:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
         try:
-            known = json.loads(state.read_text())
+            known = json.loads(state.read_text(encoding="utf-8"))
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
                     "asked": dict(known["asked"])}
         except (ValueError, LookupError, TypeError) as error:
@@ -252,7 +252,7 @@ class _Onboarding:
         self.steps[name] = {**result, "seconds": time.perf_counter() - begin}
         content = {"hand": self.hand.name, "sha256": self.hand.sha256, "asked": self._asked(), "steps": self.steps}
         with replacing(self.folder / STATE) as temporary:
-            temporary.write_text(json.dumps(content))
+            temporary.write_text(json.dumps(content), encoding="utf-8")
         self.say(f"{name}: {result['said']} ({self.steps[name]['seconds']:.0f} s)")
 
     def _check(self) -> dict[str, Any]:
@@ -372,16 +372,16 @@ def _drawn(done: Onboarded) -> str:
     config = done.config
     hand, predictor = load_hand(done.hand), GraspPredictor(done.weights, config.device, config.predictor)
     parts = []
-    for name in resolve_objects(list(config.held_out))[: config.objects_drawn]:
+    for number, name in enumerate(resolve_objects(list(config.held_out))[: config.objects_drawn], 1):
         try:
-            parts.append(_drawn_on(name, done, hand, predictor))
+            parts.append(_drawn_on(name, done.folder / f"grasps_{number}.png", done, hand, predictor))
         except NoGraspError as error:
             parts.append(f"<p class=note>{html.escape(name)}: none was found: {html.escape(str(error))}</p>")
     return "".join(parts)
 
 
-def _drawn_on(name: str, done: Onboarded, hand: Hand, predictor: GraspPredictor) -> str:
-    obj, path, asked = load_object(name), done.folder / f"{Path(name).stem}.png", done.config.grasps_drawn
+def _drawn_on(name: str, path: Path, done: Onboarded, hand: Hand, predictor: GraspPredictor) -> str:
+    obj, asked = load_object(name), done.config.grasps_drawn
     problem = GraspProblem(hand, obj, predictor.device)
     made = predictor.run(problem, GraspRequest(asked, source=done.config.source))
     draw_grasps(hand, obj, evaluate(problem, made.grasps), path)

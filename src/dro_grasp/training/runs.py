@@ -27,7 +27,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from dro_grasp.devices import fast_products, require_device
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.extras import require_extra
-from dro_grasp.files import FOREIGN, UNTYPED, is_unread, make_folder, reason_of, replacing, set_aside
+from dro_grasp.files import FOREIGN, UNTYPED, given_path, is_unread, make_folder, reading, reason_of, replacing, set_aside
 from dro_grasp.graphs import Repeated
 from dro_grasp.kinds import flat
 from dro_grasp.network.presets import NetworkConfig
@@ -185,9 +185,11 @@ def _state(path: Path) -> dict[str, Any]:
     return state
 
 
-def last_logged(folder: Path) -> dict[str, float]:
-    """The last line of a run's log: steps, seconds and losses at its end."""
-    return json.loads((folder / LOG).read_text().splitlines()[-1])
+def how_long(folder: Path) -> dict[str, int]:
+    """Steps and seconds that a run took, by its checkpoint."""
+    with reading(path := given_path(folder) / CHECKPOINT, TrainingError, "the checkpoint of a run that ended; train again"):
+        state = _state(path)
+        return {"steps": state["step"], "seconds": round(state["seconds"])}
 
 
 BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds", "tensorboard"})
@@ -320,7 +322,7 @@ class TrainingRun:
             generator: Source of all random numbers of the losses, on the model's device.
             plan: What determines the curve beside the schedule (see `run_plan`): a checkpoint resumes only with the same.
         """
-        self.folder, self.model, self.schedule, self.generator = RunFolder(folder), model, schedule, generator
+        self.folder, self.model, self.schedule, self.generator = RunFolder(given_path(folder)), model, schedule, generator
         self.processes = processes or Processes()
         self.plan = {"steps": schedule.steps, "learning_rate": schedule.learning_rate, "seed": schedule.seed,
                      "shards": schedule.shards, **(plan or {})}

@@ -120,3 +120,26 @@ def test_a_choice_that_cannot_be_sent_is_refused(choose: Any, told: str) -> None
 def test_an_address_that_is_none_is_told(address: str) -> None:
     with pytest.raises(ServerError, match=r"no grasp server answers at .*; give http://HOST:PORT"):
         dro.GraspClient(address).predict("allegro", "can")
+
+
+class Breaking(BaseHTTPRequestHandler):
+    """Refuses, and ends before all of its answer is sent."""
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.send_response(503)
+        self.send_header("Content-Length", "1000")
+        self.end_headers()
+        self.wfile.write(b'{"error": "the que')
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_an_answer_that_breaks_off_is_told_by_its_status() -> None:
+    with HTTPServer(("127.0.0.1", 0), Breaking) as server:
+        threading.Thread(target=server.serve_forever, args=[0.01], daemon=True).start()
+        with pytest.raises(ServerError, match="HTTP Error 503: Service Unavailable") as told:
+            dro.GraspClient(f"http://127.0.0.1:{server.server_port}").predict("gripper3", "can")
+        server.shutdown()
+    assert told.value.status == 503

@@ -116,6 +116,19 @@ def test_a_grasp_that_takes_long_is_not_drawn_over_a_later_one(viewer: GraspView
     assert "Grasp 1" in viewer.text.content
 
 
+def test_a_film_of_another_stage_is_not_kept(viewer: GraspViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = page_module.record
+
+    def slow(*given: object) -> object:
+        monkeypatch.setattr(viewer, "_batch", lambda: viewer.made.refined[[0, 1]])  # as when another stage is chosen
+        return honest(*given)
+
+    monkeypatch.setattr(page_module, "record", slow)
+    viewer.show(0, "grasp")
+    viewer._play()
+    assert viewer.film is None
+
+
 def test_only_this_machine_is_served(viewer: GraspViewer) -> None:
     assert viewer.server.get_host() == HOST == "127.0.0.1"
     assert viewer.url.startswith("http://127.0.0.1:")

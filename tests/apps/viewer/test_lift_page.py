@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,13 @@ from dro_grasp.apps.viewer.lift_page import EVERY, LiftPage, lift_page
 from dro_grasp.arm.clearing.record import ClearRecorder
 from dro_grasp.arm.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.arm.robot_check import robot_shapes, shape_poses
+from dro_grasp.arm.robots.loading import BUILTIN_ROBOTS
 from dro_grasp.arm.tabletop.animation import Recorder
 from dro_grasp.arm.tabletop.attempts import Attempt, write_attempts
 from dro_grasp.arm.tabletop.experiment import TabletopConfig
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, RobotError
 from dro_grasp.network.checkpoints import DEFAULT, describe_weights
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
@@ -191,6 +193,34 @@ def test_another_robot_of_the_same_name_is_refused(robot: dro.Robot, plan: dro.M
     replace(plan, notes=replace(plan.notes, T_world_wrist=T.tolist())).save(tmp_path / "other.npz")
     with pytest.raises(OptionError, match=r"is not the one of the plan in .*other.npz: its wrist is elsewhere"):
         lift_page(tmp_path / "other.npz", port=free_port())
+
+
+@pytest.mark.parametrize("kind", ["plan", "record"])
+def test_the_robot_of_a_file_is_found_where_it_was(
+    robot: dro.Robot, plan: dro.MotionPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    shutil.copytree(BUILTIN_ROBOTS, tmp_path / "lab")
+    shutil.copy(tmp_path / "lab" / "xarm7_leaphand.yaml", tmp_path / "lab" / "mine.yaml")
+    monkeypatch.chdir(tmp_path / "lab")
+    mine, file = dro.load_robot("mine.yaml"), tmp_path / "m.npz"
+    if kind == "plan":
+        T = mine.T_world_wrist(plan.arm.position[plan.part("approach").stop - 1])
+        notes = replace(plan.notes, robot="mine", robot_file=mine.source, T_world_wrist=T.tolist())
+        replace(plan, notes=notes).save(file)
+    else:
+        recorder = ClearRecorder()
+        recorder.looked(np.zeros((1, 3)))
+        recorder.frames.append((mine.home, mine.open_hand, np.zeros((0, 4, 4))))
+        recorder.record(mine).save(file)
+    monkeypatch.chdir(tmp_path)
+    shown = lift_page if kind == "plan" else clear_page
+    page = shown(file, port=free_port())
+    page.stop()
+    assert page.robot.sha256 == robot.sha256
+    (tmp_path / "lab" / "mine.yaml").unlink()
+    with pytest.raises(RobotError, match=r"the robot of .*m\.npz cannot be loaded: no robot is called .*mine\.yaml"):
+        shown(file, port=free_port())
+    shown(file, robot="xarm7_leaphand", port=free_port()).stop()
 
 
 def test_the_attempt_that_is_named_is_the_one_that_is_shown(robot: dro.Robot, tmp_path: Path) -> None:

@@ -235,6 +235,7 @@ def test_a_push_ends_in_an_overhang(narrow: Robot, pushed: tuple[dro.ObjectModel
     """In MuJoCo, with friction 0.5 between all: the thing overhangs, has not tipped, and the hand is home."""
     thing, made = pushed
     assert made.notes.slide is not None
+    assert made.notes.robot_file == narrow.source != ""
     scene = LiftScene(Workcell(narrow), [thing])
     scene.place(0, np.eye(4))
     for stage in SLIDING:

@@ -388,6 +388,7 @@ def test_a_robot_file_without_a_table_has_the_ground_for_one(
     assert "states no table: z = 0 is taken for one" in said
     made, robot = MotionPlan.load(output), dro.load_robot(small_robot)
     assert made.notes.table == 0.0
+    assert made.notes.robot_file == str(tmp_path / "robot.yaml")
     wrist = torch.from_numpy(robot.T_world_wrist(made.arm.position)).float()
     assert float(robot.hand.points(torch.from_numpy(made.hand.position).float(), wrist)[..., 2].min()) > 0
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
 
 import dro_grasp as dro
@@ -302,3 +303,36 @@ def test_the_key_home_of_an_mjcf_arm_is_home_unless_the_file_states_another(tmp_
     stated = {"arm": str(arm), "hand": "gripper3", "mount": {"link": "tip"}, "limits": {"velocity": 1.0, "acceleration": 4.0}}
     assert load_robot(written(stated, tmp_path)).home.tolist() == [0.25, -0.5]
     assert load_robot(written(stated | {"home": {"a": 0.0, "b": 0.1}}, tmp_path)).home.tolist() == [0.0, 0.1]
+
+
+def test_key_and_efforts_of_an_mjcf_arm_are_read_whatever_its_meshes_and_textures_need(tmp_path: Path) -> None:
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(tmp_path / "Box.stl")
+    mended = """<asset><texture name="t" type="2d" file="missing.png"/><material name="m" texture="t"/>
+        <mesh name="k" file="box.STL"/></asset><actuator><position joint="a" kp="100" forcerange="-20 20"/></actuator>
+        <worldbody><geom type="mesh" mesh="k" material="m"/></worldbody>"""
+    (tmp_path / "arm.xml").write_text(arm_with_key("home").replace("<mujoco>", f"<mujoco>{mended}", 1))
+    stated = {"arm": "arm.xml", "hand": "gripper3", "mount": {"link": "tip"}, "limits": {"velocity": 1.0, "acceleration": 4.0}}
+    robot = load_robot(written(stated, tmp_path))
+    assert robot.home.tolist() == [0.25, -0.5]
+    assert robot.effort.tolist() == [20, 50]
+
+
+@pytest.mark.parametrize(("line", "said"), [
+    ("name: 2024-99-99", "cannot be read as YAML: month must be in 1..12"), ("home: {a: 0x_}", "cannot be read as YAML"),
+    ("name: lab/arm", "the name is 'lab/arm'"), ("name: ..", "the name is '..'")])
+def test_an_entry_that_yaml_or_a_file_name_cannot_hold_is_told(
+    line: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "robot.yaml").write_text(f"arm: arm.xml\nhand: gripper3\n{line}\n")
+    assert main(["robot", "check", str(tmp_path / "robot.yaml")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_robot_knows_what_it_was_loaded_from(values: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = written(values, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    own, again = load_robot(file.name), load_robot(file)
+    assert own.source == again.source == str(file)
+    assert load_robot("xarm7_leaphand").source == "xarm7_leaphand"
+    file.rename(tmp_path / "renamed.yaml")
+    assert load_robot("renamed.yaml").sha256 == own.sha256

@@ -8,6 +8,7 @@ import json
 import time
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,17 +108,25 @@ class GraspClient:
             with opener.open(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
                 return json.load(answer)
         except HTTPError as error:
-            with error:
-                why = error.read().decode(errors="replace")
-                again = error.headers.get("Retry-After", "")
-            raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}",
-                              float(again) if again.isdecimal() else None, error.code) from error
+            again = error.headers.get("Retry-After", "")
+            raise ServerError(_reason(error), float(again) if again.isdecimal() else None, error.code) from error
         except TimeoutError as error:
             raise ServerError(f"the grasp server at {self.url} gave no answer in {self.timeout:g} s; ask for fewer grasps, or "
                               "give GraspClient a longer timeout") from error
         except (URLError, OSError, HTTPException, ValueError) as error:  # other programs answer in other ways
             raise ServerError(f"no grasp server answers at {self.url} ({reason_of(error)}); give http://HOST:PORT, or start "
                               "one with `dro-grasp serve`") from error
+
+
+def _reason(error: HTTPError) -> str:
+    """Why the server, or another program at its address, refuses."""
+    why = ""
+    with error, suppress(OSError, HTTPException, ValueError):  # the connection may end within the answer
+        why = error.read().decode(errors="replace")
+        told = json.loads(why)
+        if isinstance(told, dict) and isinstance(told.get("error"), str):
+            return told["error"]
+    return f"{error}: {why[:200]}"
 
 
 def listed(value: Any) -> Any:

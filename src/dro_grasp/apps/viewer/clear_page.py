@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
+from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints, robot_of
 from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, SharedPage, escaped, move, rgb
 from dro_grasp.arm.clearing.record import ClearRecord, Event, Judgement, Look, Picked
-from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.tabletop.animation import FIXTURE_COLOUR, VIEW, colour_of
 from dro_grasp.geometry.mesh_files import trimesh
@@ -120,7 +119,7 @@ def clear_page(
 ) -> ClearPage:
     """A page for what `dro-grasp clear --record` wrote; the robot is given where the record's own is not meant."""
     record = ClearRecord.load(file)
-    own = load_robot(robot or record.robot)
+    own = robot_of(file, robot, record.robot)
     require_joints(own, record.arm.shape[1], record.hand.shape[1], f"the record in {file}")
     return ClearPage(record, own, port, host, token)
 

@@ -173,7 +173,7 @@ class GraspPage(Page):
         if (film := self.film) is None:
             film = Film(grasps.T_object_wrist[index].float(), *record(self.made.hand, self.made.obj, grasps, index, protocol))
             self.film, self.moment.max, self.moment.disabled = film, len(film.poses) - 1, False
-            if self._picked() != index:  # while it was recorded
+            if self._picked() != index or self._batch() is not grasps:  # while it was recorded
                 self._forget_film()
         if self._roll(film, len(film.poses), self.frame_seconds):
             self._say("Played. Move *Moment* to see any moment again.")

@@ -11,7 +11,7 @@ import torch
 import viser
 
 from dro_grasp.apps.viewer.film import RATE, Film
-from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints
+from dro_grasp.apps.viewer.robot_view import HoldSign, RobotView, require_joints, robot_of
 from dro_grasp.apps.viewer.scene_view import HOST, PATIENCE, POINT_SIZE, Page, ServedPage, SharedPage, escaped, move, rgb
 from dro_grasp.arm.planning.motion import CHOSEN, READY, WAITING, MotionPlan
 from dro_grasp.arm.robots.loading import load_robot
@@ -218,7 +218,7 @@ def lift_page(
     """
     if file.suffix.lower() == ".npz":
         plan = MotionPlan.load(file)
-        own = load_robot(robot or plan.notes.robot)
+        own = robot_of(file, robot, plan.notes.robot_file or plan.notes.robot)
         require_joints(own, len(plan.notes.arm_joints), len(plan.notes.hand_joints), f"the plan in {file}")
         _require_same(own, plan, file)
         page = LiftPage(own, (), weights, port, host, token=token)
@@ -229,7 +229,7 @@ def lift_page(
         raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; attempt={chosen} is none of them")
     if robot is not None:
         attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
-    first = load_robot(attempts[chosen].robot_file or attempts[chosen].robot)
+    first = robot_of(file, robot, attempts[chosen].robot_file or attempts[chosen].robot)
     page = LiftPage(first, attempts, weights, port, host, make, token)
     with page._busy:  # a browser may be there already
         page.repeat(chosen)

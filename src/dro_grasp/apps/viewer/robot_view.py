@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.apps.viewer.scene_view import Client, move, rgb
 from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
+from dro_grasp.arm.robots.loading import load_robot
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import HandError, OptionError, RobotError
 from dro_grasp.geometry.rendering.rasterizer import Colour
 from dro_grasp.grasps.hold import HoldState
 
@@ -56,6 +59,20 @@ def require_joints(robot: Robot, arm: int, hand: int, what: str) -> None:
     if own != (arm, hand):
         raise OptionError(f"robot '{robot.name}' has {own[0]} joints in its arm and {own[1]} in its hand, and {what} {arm} and "
                           f"{hand}; give its own robot (robot=...), or leave it out")
+
+
+def robot_of(file: Path, given: str | None, recorded: str) -> Robot:
+    """The robot that is given, else the one that a file of motions names.
+
+    Raises:
+        RobotError: It cannot be used, or is not where the file says.
+    """
+    if given is not None:
+        return load_robot(given)
+    try:
+        return load_robot(recorded)
+    except (RobotError, HandError) as error:
+        raise RobotError(f"the robot of {file} cannot be loaded: {error}; or name its file now (robot=...)") from error
 
 
 class HoldSign:

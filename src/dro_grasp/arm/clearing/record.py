@@ -173,8 +173,8 @@ class ClearRecorder(Recorder):
     def _moment(self) -> int:
         return max(0, len(self.frames) - 1)
 
-    def record(self, robot: Robot, name: str | None = None) -> ClearRecord:
-        """What was kept; the robot's name, or its file.
+    def record(self, robot: Robot) -> ClearRecord:
+        """What was kept.
 
         Raises:
             PlanError: Nothing has moved.
@@ -185,7 +185,7 @@ class ClearRecorder(Recorder):
         meshes = [[(o.vertices, o.faces) for o in things if o.vertices is not None and o.faces is not None]
                   for things in (self.objects, self.fixtures)]
         return ClearRecord(
-            name or robot.name, robot.sha256, self.rate, arm, hand, poses, tuple(obj.name for obj in self.objects),
+            robot.source or robot.name, robot.sha256, self.rate, arm, hand, poses, tuple(obj.name for obj in self.objects),
             tuple(meshes[0]), tuple(meshes[1]), tuple(self.clouds), tuple(self.events))
 
 

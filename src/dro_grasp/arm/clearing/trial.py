@@ -87,9 +87,7 @@ class SimulatedRig:
     def move(self, arm: Trajectory, hand: Trajectory) -> None:
         """As of `Rig`."""
         call = None if self._watch is None else lambda: self._watch.moved(self.scene)  # type: ignore[union-attr]
-        for i in range(1, len(arm.time)):
-            self.scene.command(arm.position[i], arm.velocity[i], hand.position[i])
-            self.scene.advance(float(arm.time[i] - arm.time[i - 1]), call)
+        self.scene.follow(arm, hand, slice(0, len(arm.time)), call)
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
         """As of `Rig`."""

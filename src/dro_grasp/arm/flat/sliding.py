@@ -337,7 +337,8 @@ class _Pusher:
         return PlanNotes(
             robot.name, self.obj.name, robot.arm_joints, robot.hand_joints, "world", robot.table.height, 0, {}, 0, -1, 0.0,
             robot.T_world_wrist(first).tolist(), self.seed, {}, slide=push.motion.tolist(),
-            zeros=None if drivers.are_usual else drivers.zeros, scales=None if drivers.are_usual else drivers.scales)
+            zeros=None if drivers.are_usual else drivers.zeros, scales=None if drivers.are_usual else drivers.scales,
+            robot_file=robot.source)
 
     def _scene(self) -> PlanScene:
         n = len(self.robot.hand_joints)

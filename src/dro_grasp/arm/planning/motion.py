@@ -116,6 +116,8 @@ class PlanNotes:
     is, by the rehearsal [m]; None in plans without a place."""
     rehearsed: float | None = None
     """Share of its rehearsed lifts in which the grasp holds the object; None where nothing was rehearsed."""
+    robot_file: str = ""
+    """Name of a built-in robot, or the path of the robot's file; empty if unknown."""
 
 
 @dataclass(frozen=True, eq=False)

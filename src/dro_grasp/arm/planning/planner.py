@@ -348,7 +348,8 @@ def _described(
         zeros=None if robot.drivers.are_usual else robot.drivers.zeros,
         scales=None if robot.drivers.are_usual else robot.drivers.scales,
         hold={name: tuple(expected.extra[name][0].double().reshape(-1).tolist()) for name in (*HOLD_COLUMNS, WEIGHT_COLUMN)},
-        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist(), rehearsed=tries.share.get(chosen))
+        T_world_held=None if goal.put is None else goal.put.T_grasp.tolist(), rehearsed=tries.share.get(chosen),
+        robot_file=robot.source)
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))

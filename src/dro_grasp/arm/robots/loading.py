@@ -18,7 +18,7 @@ from dro_grasp.arm.robots.robot import Robot
 from dro_grasp.arm.robots.robot_file import RobotFile, is_number, quoted
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.files import given_path
-from dro_grasp.hands.description.compiling import MAX_TURN
+from dro_grasp.hands.description.compiling import MAX_TURN, mujoco_speaks_to
 from dro_grasp.hands.description.loader import Description, load_description, named
 from dro_grasp.hands.description.reduction import NO_LIMITS
 from dro_grasp.hands.description.xml_files import parse_xml
@@ -55,7 +55,8 @@ def load_robot(name: str | Path) -> Robot:
         RobotError: The file, its arm, or how the two fit; the message names the entry and a remedy.
         HandError: The hand cannot be used.
     """
-    file = RobotFile(locate_robot(name))
+    path = locate_robot(name)
+    file = RobotFile(path)
     with file.faults as faults:  # all at once, since each would cost its reader a round
         hand = locate_hand(file.hand)
         within = hand.link if hand.path.resolve() == file.arm.resolve() else None
@@ -76,9 +77,10 @@ def load_robot(name: str | Path) -> Robot:
             for kind, usual in (("velocity", None), ("acceleration", None), ("effort", 50.0)))
         fast, quick = (faults.of(lambda kind=kind: _hand_limit(file, hand.path, loaded, kind), np.zeros(loaded.tree.n_dof))
                        for kind in HAND_LIMITS)
+    source = path.stem if path.parent == BUILTIN_ROBOTS else str(path.resolve())
     return Robot(
         file.name, arm, loaded, fit.mount, file.T_link_wrist, file.T_world_base, home, lower, upper, velocity, acceleration,
-        effort, fast, quick, file.camera, file.table, drivers)
+        effort, fast, quick, file.camera, file.table, drivers, source)
 
 
 def _hand_limit(file: RobotFile, path: Path, hand: Hand, kind: str) -> Float[np.ndarray, " n_dof"]:
@@ -240,12 +242,33 @@ def _home_key(path: Path) -> dict[str, float] | None:
     """The key `home` of an MJCF file by joint; None where there is none."""
     if parse_xml(path).tag == "robot":
         return None
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model = _bare(path)
     if (key := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, HOME_KEY)) < 0:
         return None
     single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
     return {model.joint(i).name: float(model.key_qpos[key, model.jnt_qposadr[i]])
             for i in range(model.njnt) if int(model.jnt_type[i]) in single}
+
+
+def _bare(path: Path) -> mujoco.MjModel:
+    """Joints, actuators and keys of an MJCF file: compiled without meshes, textures and masses, which may need repair."""
+    try:
+        with mujoco_speaks_to([], path):
+            spec = mujoco.MjSpec.from_file(str(path))
+            for geom in spec.geoms:
+                if geom.meshname or geom.hfieldname:
+                    geom.meshname = geom.hfieldname = ""
+                    geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, [0.01, 0.0, 0.0]
+            for body in list(spec.bodies)[1:]:
+                body.explicitinertial, body.mass, body.inertia, body.fullinertia = True, 1.0, np.ones(3), np.full(6, np.nan)
+            for material in spec.materials:
+                material.textures = [""] * len(material.textures)
+            for item in [*spec.meshes, *spec.hfields, *spec.skins, *spec.textures]:
+                spec.delete(item)
+            return spec.compile()
+    except HandError as error:
+        raise RobotError(f"keys and actuators of the arm cannot be read: {error}; correct the file, or state 'home' and "
+                         "the effort in 'limits'") from error
 
 
 def _stated_limits(path: Path, kind: str) -> dict[str, float]:
@@ -270,7 +293,7 @@ def _stated_limits(path: Path, kind: str) -> dict[str, float]:
 
 
 def _mjcf_efforts(path: Path) -> dict[str, float]:
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model = _bare(path)
     limited = [i for i in range(model.njnt) if model.jnt_actfrclimited[i]]
     found = {model.joint(i).name: float(model.jnt_actfrcrange[i].max()) for i in limited}
     for i in range(model.nu):

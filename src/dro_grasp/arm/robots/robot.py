@@ -94,6 +94,8 @@ class Robot:
     """The table that objects stand on; None without one."""
     drivers: Drivers
     """How the drivers of arm and hand count the joints."""
+    source: str = ""
+    """Name of a built-in robot, or the path of its file, from which it was loaded; empty where it was made otherwise."""
 
     @property
     def arm_joints(self) -> tuple[str, ...]:
@@ -108,7 +110,7 @@ class Robot:
     @property
     def sha256(self) -> str:
         """Hash of all that motions depend on: robots of one hash are the same, whatever they and their files are called."""
-        other = ("name", "arm.", "hand.", "drivers")
+        other = ("name", "source", "arm.", "hand.", "drivers")
         own = {name: value for name, value in flat(self).items() if not name.startswith(other)}
         stated = own | {"arm": self.arm.sha256, "hand": self.hand.sha256}
         return hashlib.sha256(json.dumps(stated, sort_keys=True, default=_rounded).encode()).hexdigest()

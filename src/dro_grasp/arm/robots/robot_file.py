@@ -59,12 +59,14 @@ class RobotFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            values = yaml.safe_load(path.read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # of values such as the date 2024-99-99, too
             raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
         known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table", *DRIVER_KEYS}
         values = self.mapping(values, "the file", known, {"arm", "hand"})
         self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
+        if not self.name.isprintable() or not self.name.strip(" .") or "/" in self.name:
+            raise self.error(f"the name is {self.name!r}; files are called by it, so give letters, digits, spaces, '-' or '_'")
         hand = str(values["hand"])
         file, link = split_part(str(path.parent / hand))
         self.hand = named(file, link) if given_path(file).is_file() else hand

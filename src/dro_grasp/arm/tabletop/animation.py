@@ -86,10 +86,10 @@ def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
         pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], duration=lengths, loop=0, **options)
 
 
-def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
-    """Run the first attempt of a run once more, and write its animation."""
-    robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
-    result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
+def draw_attempt(run: TabletopRun, chosen: Attempt, path: Path) -> Attempt:
+    """Repeat an attempt of a run, and write its animation."""
+    robot, obj, recorder = load_robot(run.robot), load_object(chosen.object_file), Recorder()
+    result = attempt(robot, obj, chosen.number, run.seed, GraspPredictor(run.weights), run.config, recorder)
     draw_animation(robot, recorder, path)
     return result
 

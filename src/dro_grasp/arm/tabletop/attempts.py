@@ -83,6 +83,11 @@ class Attempt:
     solid_sha256: str = ""
     """Hash of what was simulated of the object. The same mesh may be cut into other convex parts."""
 
+    @property
+    def moved(self) -> bool:
+        """Whether the robot carried out a motion."""
+        return self.pushes > 0 or self.stage not in {"see", "plan"}
+
 
 def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
     """Write all attempts to a Parquet file, which appears whole or not at all."""

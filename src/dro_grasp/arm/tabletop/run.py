@@ -210,6 +210,6 @@ def _attempted(
     robot, obj, predictor = loaded
     keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
     return replace(
-        make(robot, obj, number, run.seed, predictor, run.config, keeper), robot_file=str(run.robot), object_file=str(name),
+        make(robot, obj, number, run.seed, predictor, run.config, keeper), robot_file=robot.source, object_file=str(name),
         weights=str(run.weights or DEFAULT), robot_sha256=robot.sha256, object_sha256=obj.sha256,
         weights_sha256=describe_weights(run.weights)["sha256"], solid_sha256=obj.solid_sha256)

@@ -85,7 +85,7 @@ def make_hand(seed: int) -> MadeHand:
         for _ in range(MAX_DRAWS):
             plan = sample_plan(generator)
             text = write_urdf(plan, name)
-            file.write_text(text)
+            file.write_text(text, encoding="utf-8")
             try:
                 reason = why_unfit(plan, check_hand(file))
             except HandError as error:

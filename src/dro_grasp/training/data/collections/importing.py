@@ -28,8 +28,9 @@ from dro_grasp.errors import GraspFileError, ObjectError, OptionError
 from dro_grasp.files import UNTYPED, given_path, reading
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
-from dro_grasp.hands.library import load_hand
+from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.training.data.engine.schedule import require_distinct_names
 
 Format = Literal["cmap", "dexgraspnet", "dexgraspbench"]
 WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")  # Names of the wrist's six coordinates. Source: DexGraspNet
@@ -211,6 +212,7 @@ def import_grasps(
         raise OptionError(f"no file to import was given; name at least one {kind} file")
     groups: dict[tuple[str, str, float], list[ForeignGrasp]] = {}
     named: set[str] = set()
+    spelled: dict[Any, str] = {}
     for path in paths:
         for grasp in read_foreign(path, kind):
             named.add(grasp.hand)
@@ -219,10 +221,13 @@ def import_grasps(
                 raise OptionError(f"{path} does not name its hand; name it with hands=...")
             if not (obj or grasp.object):
                 raise OptionError(f"{path} does not name its object; name it with object=...")
+            file = locate_hand(hand)
+            hand = spelled.setdefault((file.path.resolve(), file.link), hand)  # however its path was given
             groups.setdefault((hand, obj or grasp.object, grasp.scale), []).append(grasp)
     if named and (unknown := sorted(hands.keys() - named - {""})):
         theirs = ", ".join(sorted(named - {""})) or "none"
         raise OptionError(f"no grasp is of a hand called {', '.join(unknown)}; the hands in the files are {theirs} (hands=...)")
+    require_distinct_names(list(spelled.values()), ())
     batches: dict[str, list[GraspBatch]] = {}
     missing: dict[str, str] = {}
     for (hand, name, scale), grasps in groups.items():

@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
-from os.path import commonpath
+from itertools import takewhile
 from pathlib import Path
 
 import torch
@@ -119,8 +120,9 @@ def _joints(axes: Axes, hand: HandCoverage) -> None:
 
 def short_names(names: Sequence[str]) -> list[str]:
     """Names without what all begin with, cut to their last LABEL characters unless two would be the same."""
-    begin = len(commonpath(list(names))) if len(names) > 1 else 0
-    own = [name[begin:] or name for name in names]
+    parts = [re.split("(?<=[/:])", name) for name in names]  # of which the last is the joint's own
+    shared = list(takewhile(lambda part: len(set(part)) == 1, zip(*(part[:-1] for part in parts), strict=False)))
+    own = ["".join(part[len(shared):]) for part in parts]
     cut = [name if len(name) <= LABEL else f"…{name[1 - LABEL:]}" for name in own]
     return cut if len(set(cut)) == len(cut) else own
 
