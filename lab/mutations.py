@@ -122,7 +122,7 @@ FAULTS = (
           "touch beside the contact region ignored"),
     Fault("predict/score/features.py", "arriving=near.points - before", "arriving=before - near.points",
           "sign of a feature of the score"),
-    Fault("files.py", "os.replace(temporary, path)", "path.write_bytes(temporary.read_bytes())",
+    Fault("files.py", "os.replace(temporary, place)", "path.write_bytes(temporary.read_bytes())",
           "a file is written in place instead of replaced at once"),
     Fault("compare/metrics.py", "q - p - math.hypot(q - q_low, p_high - p)", "q - p - math.hypot(q - q_low, p - p_low)",
           "Newcombe's interval takes the wrong end of Wilson's"),
