@@ -14,11 +14,13 @@ from PIL import Image
 from dro_grasp.apps.viewer.studio import StudioServer
 from dro_grasp.cli.generate import paths_per_object
 from dro_grasp.cli.main import main, parse
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, NoGraspError
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.training.data.collections import checking, filtering
 from tests.helpers.browser import free_port
@@ -202,3 +204,29 @@ def test_results_of_objects_whose_names_look_alike_keep_a_file_each(tmp_path: Pa
     files = paths_per_object(tmp_path, names, True, ".parquet")
     assert [file.name for file in files if file is not None] == [
         "mug_obj.parquet", "mug_ply.parquet", "mug_obj-2.parquet", "can.parquet"]
+
+
+def test_an_object_without_any_grasp_counts_in_later_rates(
+    tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    honest = GraspPredictor.run_many
+
+    def run_many(self: GraspPredictor, problems: list[GraspProblem], *others: object) -> list[object]:
+        nothing = NoGraspError("none is trusted")
+        return [nothing if problems[0].obj.name == "large" else made for made in honest(self, problems, *others)]
+
+    monkeypatch.setattr(GraspPredictor, "run_many", run_many)
+    for name, size in (("small", 0.03), ("large", 0.04)):
+        trimesh.creation.box((size, size, 0.1)).export(tmp_path / f"{name}.stl")
+    (tmp_path / "in").mkdir()
+    for name in ("small", "large"):
+        (tmp_path / f"{name}.stl").rename(tmp_path / "in" / f"{name}.stl")
+    output = tmp_path / "out"
+    quickly = ["--source", "network", "--candidates", "1", "--no-refine", "--protocol", "none"]
+    assert main(["generate", "--hand", "gripper3", "--object", str(tmp_path / "in"), "--weights", weights, "--num", "2",
+                 *quickly, "--output", str(output)]) == 2
+    assert {file.name for file in output.iterdir()} == {"small.parquet", "large.parquet"}
+    capsys.readouterr()
+    assert main(["evaluate", str(output), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["asked"], told["num"]) == (4, 2)

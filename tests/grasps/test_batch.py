@@ -108,6 +108,8 @@ def test_of_grasps_of_which_some_were_tried_the_others_did_not_hold():
     assert both.success.tolist() == [False, False, True, False, True]
     with pytest.raises(ValueError, match="'success'"):
         both.replace(extra={"success": torch.zeros(5)})
+    with pytest.raises(ValueError, match="wrist_position"):
+        both.replace(extra={"wrist_position": torch.zeros(5, 3)})
 
 
 @pytest.mark.parametrize("index", [True, False, np.True_, torch.tensor(True), 1.0, [0.5], "1", None, [[True, False, True]]])
@@ -315,3 +317,13 @@ def test_poses_alone_have_no_trial() -> None:
 def test_other_poses_know_no_hold() -> None:
     batch = make(2).replace(extra={"held_joints": torch.zeros(2, 1), "q1": torch.ones(2), "mine": torch.ones(2)})
     assert set(batch.with_poses(batch.T_object_wrist, batch.joints).extra) == {"mine"}
+
+
+@pytest.mark.parametrize(("name", "column", "told"), [
+    ("frame", torch.arange(2), "'frame' holds int64, expected texts"),
+    ("frame", ["a", "b"], "lacks the column 'T_frame_camera'"),
+    ("object_mass", ["1", "2"], "'object_mass' holds .*string, expected numbers")])
+def test_what_no_file_could_be_read_with_is_not_saved(name: str, column: object, told: str, tmp_path: Path) -> None:
+    with pytest.raises(GraspFileError, match=f"what is to be saved.*{told}"):
+        make(2).replace(extra={name: column}).save(tmp_path / "grasps.parquet")
+    assert not (tmp_path / "grasps.parquet").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from pathlib import Path
@@ -12,10 +13,11 @@ import pytest
 import torch
 
 import dro_grasp as dro
-from dro_grasp.errors import DroGraspError
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.objects.shape import DENSITY, solid_of, with_mass
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict import finish
+from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig, weigh_settled_all, weight_config
@@ -144,3 +146,17 @@ def test_the_time_for_weighing_is_told(tmp_path: Path, monkeypatch: pytest.Monke
     assert made.seconds["weigh"] > 0.25
     assert 0.125 < made.seconds["ease"] < made.seconds["weigh"]
     assert 0.8 * whole < sum(made.seconds.values()) <= whole
+
+
+@pytest.mark.parametrize("call", ["run", "run_many", "rounds"])
+@pytest.mark.parametrize(("hand", "refined", "why"), [
+    (HAND, False, "with refine=False none does"), (dataclasses.replace(HAND, description=None), True, "no description")])
+def test_limits_of_forces_are_refused_where_nothing_settles(
+    call: str, hand: dro.Hand, refined: bool, why: str, tmp_path: Path
+) -> None:
+    predictor, request = dro.GraspPredictor(untrained_weights(tmp_path)), GraspRequest(1, refine=refined)
+    problem = GraspProblem(hand, CAN, constraints=Constraints(max_force=2.0, margin=2.0))
+    calls = {"run": lambda: predictor.run(problem, request), "run_many": lambda: predictor.run_many([problem], request),
+             "rounds": lambda: next(predictor.rounds(problem, request))}
+    with pytest.raises(OptionError, match=f"margin and max_force say how hands squeeze once they settle, and .*{why}"):
+        calls[call]()

@@ -142,6 +142,14 @@ def test_words_count_what_became_of_candidates(jaws: Hand, tmp_path: Path) -> No
     assert "Take a stronger hand" in heavy
 
 
+def test_limits_of_forces_are_named_where_grasps_give_way(jaws: Hand, tmp_path: Path) -> None:
+    limits = Constraints(max_force=1.0, margin=5.0)
+    problem = GraspProblem(jaws, box(tmp_path, 0.05, 0.05, 0.2), constraints=limits)
+    words = Tally(0, 20, {}, {GIVES_WAY: 9}, 0.1).in_words(problem, 4, alone=False)
+    assert "or allow more max_force (now 1 N); or ask for a smaller margin (now 5)" in words
+    assert "max_force" not in Tally(0, 20, {}, {AWAY: 9}, 0.1).in_words(problem, 4, alone=False)
+
+
 @pytest.fixture(scope="module")
 def predictor(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
     path = untrained_weights(tmp_path_factory.mktemp("weights"))

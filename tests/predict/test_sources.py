@@ -124,6 +124,18 @@ def test_what_is_no_source_is_explained(mine: Path, name: str, told: str) -> Non
         make_source(name)
 
 
+@pytest.mark.parametrize(("code", "told"), [
+    ("class Mine:\n  def", "SyntaxError"), ("open('missing.pt')", "FileNotFoundError.*missing.pt"),
+    ("1 / 0", "ZeroDivisionError")])
+def test_a_module_that_fails_when_it_is_imported_is_explained(
+    code: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_module.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(OptionError, match=rf"'broken_module:Mine' cannot be imported \({told}"):
+        make_source("broken_module:Mine")
+
+
 def test_what_a_class_returns_is_checked() -> None:
     class Returns:
         def __init__(self, grasps: object) -> None:

@@ -89,6 +89,20 @@ def test_a_name_that_reads_as_a_label_is_refused(name):
         Protocol(name)
 
 
+@pytest.mark.parametrize(("field", "value"), [
+    ("friction", -1.0), ("friction", math.nan), ("mass", 0.0), ("mass_factor", -2.0), ("force_time", 0.0), ("timestep", 0.0),
+    ("timestep", math.inf), ("force", -0.5), ("noslip", -1), ("max_displacement", math.nan), ("max_penetration", -0.01)])
+def test_numbers_that_no_trial_has_are_refused_by_name(field, value):
+    with pytest.raises(OptionError, match=f"{field} of protocol 'mine' is {value}; give a number"):
+        replace(protocol("carry"), name="mine", **{field: value})
+
+
+def test_a_gradual_closing_has_time_for_its_steps():
+    with pytest.raises(OptionError, match=r"closing_time of protocol 'mine' is 0.05 s, less than 20 time steps of 0.004 s"):
+        replace(protocol("dexgraspbench"), name="mine", closing_time=0.05)
+    assert replace(protocol("dro"), name="mine", closing_time=0.05, force=0.0, damping=0.0).closing_time == 0.05
+
+
 def test_unknown_name_lists_the_choices():
     with pytest.raises(OptionError, match=r"'hard'.*dro, strict, robust, dro_static"):
         protocol("hard")

@@ -112,6 +112,10 @@ class Generate:
                 try:
                     if isinstance(made, DroGraspError):
                         raise made
+                    if isinstance(made, Nothing):
+                        if several and output is not None:  # whoever counts success has to know what was asked for in vain
+                            made.none.with_asked(self.num).save(output)
+                        raise made.error
                     done.append(self._finish(job, made, name, output, picture))
                 except DroGraspError as error:
                     if not several:
@@ -202,6 +206,8 @@ class Generate:
 
     def _predict(self, job: Job, names: list[str]) -> list[Predicted | DroGraspError]:
         """What is predicted of each object, or why there is nothing."""
+        from dro_grasp.grasps.batch import GraspBatch
+
         found: list[Any] = []
         for name in names:
             try:
@@ -214,12 +220,12 @@ class Generate:
         with progress_bar("predicting", self.json) as progress:
             made = iter(job.predictor.run_many(problems, job.request, progress) if problems else [])
         share = (time.perf_counter() - begin) / max(1, len(ready))
-        results: list[Predicted | DroGraspError] = []
+        results: list[Predicted | Nothing | DroGraspError] = []
         for each in found:
             if not isinstance(each, Ready):
                 results.append(each)
             elif isinstance(own := next(made), DroGraspError):
-                results.append(own)
+                results.append(Nothing(GraspBatch.none(job.hand, each.problem.obj), own))
             else:
                 results.append(Predicted(each.problem, own, each.seconds, share))
         return results
@@ -349,6 +355,13 @@ class Predicted(NamedTuple):
     made: Prediction
     load: float  # time of reading it [s]
     share: float  # and of predicting, of those that were predicted together an equal share [s]
+
+
+class Nothing(NamedTuple):
+    """An object for which there is no grasp."""
+
+    none: GraspBatch
+    error: DroGraspError  # which says why
 
 
 @dataclass(frozen=True)

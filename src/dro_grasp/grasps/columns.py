@@ -23,6 +23,7 @@ FLOATS = ("score", "energy", *TRIAL_FLOATS, *CARRYING)  # All columns of one num
 POSTURES = ("pregrasp_joints", "squeeze_joints")  # Columns of one number per joint; a row of NaN is not stated
 PER_JOINT = (*POSTURES, "squeeze_torque")  # The same, with the torques
 TEXTS = ("object", "object_sha256", "split", "provenance")  # Columns of one string per grasp; the empty string is unknown
+POSE_IN_FILES = ("wrist_position", "wrist_quaternion_wxyz")  # Columns of a grasp file that hold the pose of the wrist
 COLUMNS = ("T_object_wrist", "joints", "seed", "trial_success", "protocol", *FLOATS, *PER_JOINT, *TEXTS)
 """Fields of a batch with one entry per grasp."""
 MAY_BE_UNKNOWN = ("score", "energy", *CARRYING, *PER_JOINT)
@@ -70,7 +71,7 @@ def require_fit(batch: Any, n_names: int) -> None:
         raise ValueError(f"a batch of {n} grasps has columns of other lengths: {wrong}")
     if batch.joints.shape[1] != n_names:
         raise ValueError(f"{batch.joints.shape[1]} values for {n_names} joint names")
-    if taken_names := sorted(batch.extra.keys() & {*COLUMNS, "success"}):
+    if taken_names := sorted(batch.extra.keys() & {*COLUMNS, "success", *POSE_IN_FILES}):
         raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
     if deep := {name: tuple(v.shape) for name, v in batch.extra.items() if isinstance(v, Tensor) and v.ndim > 2}:
         raise ValueError(f"further columns have more than two axes: {deep}; give (n) or (n k), or a column for each part")

@@ -278,6 +278,7 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     stored |= {name: text_column(getattr(batch, name)) for name in columns.TEXTS[1:]}
     stored["seed"] = plain_column(batch.seed.cpu().numpy())
     stored |= {name: _further_column(name, value) for name, value in batch.extra.items()}
+    check_columns(pa.schema([(name, column.type) for name, column in stored.items()]), "what is to be saved")
     header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
               "joint_names": list(batch.joint_names)}
     if batch.asked_of:

@@ -212,10 +212,12 @@ class GraspPredictor:
             For each problem what `run` returns, or the error of one without any grasp.
 
         Raises:
-            OptionError: There is no such source, it does not know the hand, or so many grasps settle on a device and the extra
-                for that is missing.
+            OptionError: There is no such source, it does not know the hand, forces are limited and nothing settles, or so many
+                grasps settle on a device and the extra for that is missing.
         """
         self._require_worlds(problems, request)
+        for problem in problems:
+            self._require_settling(problem, request)
         under_way = [_Asking(self, problem, request) for problem in problems]
         rounds = {asking: asking.rounds(*self._roles(asking.problem, request)) for asking in under_way}
         while rounds:
@@ -236,6 +238,7 @@ class GraspPredictor:
         Yields:
             Complete grasps with scores, the best score first; as many as were asked for at most.
         """
+        self._require_settling(problem, request)
         asking, shown = _Asking(self, problem, request), torch.zeros(0, dtype=torch.bool)
         for wanted in asking.rounds(*self._roles(problem, request)):
             _take([asking], [wanted], None)
@@ -265,6 +268,16 @@ class GraspPredictor:
             config = self.config.network
             return NetworkSource(self.network, config if temperature is None else replace(config, temperature=temperature))
         return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
+
+    def _require_settling(self, problem: GraspProblem, request: GraspRequest) -> None:
+        """Refuse limits of forces where no hand settles, which alone tells forces: OptionError."""
+        stated = [name for name in ("margin", "max_force") if getattr(problem.constraints, name) is not None]
+        if stated and not (request.refine and self.config.finish.settle is not None and can_settle(problem)):
+            why = ("its hand has no description to simulate" if request.refine and not can_settle(problem) else
+                   "with refine=False none does")
+            says = "say" if stated[1:] else "says"
+            raise OptionError(f"{' and '.join(stated)} {says} how hands squeeze once they settle, and {why}; leave out one of "
+                              "them")
 
     def _require_worlds(self, problems: Sequence[GraspProblem], request: GraspRequest) -> None:
         """Refuse at once what would settle on a device without the extra for that: so many candidates together."""

@@ -72,10 +72,11 @@ class GraspProblem:
         return self.table is not None and around is not None and around.touch_plane and lies_low(self.obj, self.table)
 
     def on_table(self, grasps: GraspBatch) -> GraspBatch:
-        """The grasps with the table that is there while the hand closes, in simulation too; as they are without one."""
-        if self.table is None:
-            return grasps
-        return grasps.replace(extra={**grasps.extra, TABLE: self.table.repeat(len(grasps), 1)})
+        """The grasps with the table that is there while the hand closes, in simulation too, or with none."""
+        extra = {name: column for name, column in grasps.extra.items() if name != TABLE}
+        if self.table is not None:
+            extra[TABLE] = self.table.repeat(len(grasps), 1)
+        return grasps.replace(extra=extra)
 
     @property
     def hand_reach(self) -> float:

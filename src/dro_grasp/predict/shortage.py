@@ -19,6 +19,7 @@ from dro_grasp.objects.scenery import Scene
 from dro_grasp.predict.admission import PLANE, dropped_in_words
 from dro_grasp.predict.finish import Finished
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import GIVES_WAY
 from dro_grasp.simulation.protocols import CARRY
 
 POSTURES = 17  # Postures from open to closed in which fingertips are compared (ours)
@@ -75,6 +76,7 @@ class Tally:
         steps = [*dict.fromkeys(misfit.remedy for misfit in misfits)]
         if not steps:
             steps.append("try another seed")
+        steps += firmer(problem) if self.doubted.get(GIVES_WAY) else []
         steps += advice(problem, self.dropped) + (["use the source 'auto'"] if alone else [])
         if doubted:
             steps.append("see the doubtful ones with least_confidence=0")
@@ -109,6 +111,13 @@ def advice(problem: GraspProblem, dropped: Mapping[str, int]) -> list[str]:
     if constraints.table is None and dropped.get(PLANE):
         given.append("state the table's height if it is lower than the one found in the cloud")
     return given
+
+
+def firmer(problem: GraspProblem) -> list[str]:
+    """Which limits of forces to relax where grasps give way."""
+    margin, most = problem.constraints.margin, problem.constraints.max_force
+    return ([f"allow more max_force (now {_short(most)} N)"] if most is not None else []) + (
+        [f"ask for a smaller margin (now {_short(margin)})"] if margin is not None else [])
 
 
 def _room(obstacles: Scene | None) -> str:

@@ -13,6 +13,14 @@ from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.kinds import Checked
 
 NAME = re.compile(r"[\w.-]+")  # Names of protocols: nothing that stands between the parts of a label
+ABOVE_ZERO = ("friction", "mass", "mass_factor", "closing_time", "force_time", "timestep", "impratio", "stiffness",
+              "force_limit", "lever")
+"""Numbers of a protocol that are above 0."""
+FROM_ZERO = ("torsional_friction", "force", "noslip", "damping", "armature")  # Those that may be 0, too
+LIMITS = ("max_displacement", "max_rotation", "max_closing_shift", "max_closing_rotation", "max_penetration",
+          "max_self_penetration")
+"""What a success stays below."""
+SHORTEST_RAMP = 20  # Time steps of a gradual closing, at least: each of its halves moves the targets in ten
 
 
 @dataclass(frozen=True)
@@ -119,10 +127,20 @@ class Protocol(Checked):
     """Further trials of each grasp under other conditions."""
 
     def __post_init__(self) -> None:
-        """Refuse a name that labels could not be told apart with: OptionError."""
+        """Refuse a name that labels could not be told apart with, and numbers that no trial has: OptionError."""
         super().__post_init__()
         if not NAME.fullmatch(self.name):
             raise OptionError(f"'{self.name}' is no name of a protocol; use letters, digits, '_', '-' and '.'")
+        for name in (*ABOVE_ZERO, *FROM_ZERO):
+            value, least = getattr(self, name), "above 0" if name in ABOVE_ZERO else "from 0 on"
+            if value is not None and not (0 < value < math.inf or (value == 0 and name in FROM_ZERO)):
+                raise OptionError(f"{name} of protocol '{self.name}' is {value}; give a number {least} ({name}=...)")
+        if wrong := [name for name in LIMITS if not getattr(self, name) > 0]:
+            raise OptionError(f"{wrong[0]} of protocol '{self.name}' is {getattr(self, wrong[0])}; give a number above 0, or "
+                              f"inf for no limit ({wrong[0]}=...)")
+        if self.gradual and self.closing_time < SHORTEST_RAMP * self.timestep:
+            raise OptionError(f"closing_time of protocol '{self.name}' is {self.closing_time} s, less than {SHORTEST_RAMP} "
+                              f"time steps of {self.timestep} s; give more, or a shorter timestep")
 
     @property
     def label(self) -> str:

@@ -112,6 +112,6 @@ def _own_class(module: str, attribute: str) -> Any:
         sys.path.append(str(Path.cwd()))
     try:
         return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise OptionError(f"source '{module}:{attribute}' cannot be imported ({error}); give a module that Python finds from "
-                          "here, and a class in it") from error
+    except Exception as error:  # as above
+        raise OptionError(f"source '{module}:{attribute}' cannot be imported ({type(error).__name__}: {error}); give a module "
+                          "that Python finds from here, and a class in it") from error
