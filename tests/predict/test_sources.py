@@ -13,10 +13,12 @@ from dro_grasp.cli.main import main
 from dro_grasp.compare.methods import Method, MethodOptions, make_method
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import TABLE
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.network import NetworkSource
@@ -259,3 +261,11 @@ def test_a_source_without_a_name_of_its_own_goes_by_the_one_that_it_was_given(re
     made = ask(make_source("mine"), GraspProblem(toy_hand(), load_object("sphere")), 2, 0)
     assert made.origin == ("mine", "mine")
     assert list(made.seconds) == ["mine"]
+
+
+def test_grasps_that_were_made_on_a_table_have_none_where_there_is_none() -> None:
+    hand, obj = loaded_hand("gripper3"), load_object("can")
+    on = GraspProblem(hand, obj, constraints=Constraints(table=-0.05))
+    there = on.on_table(made_up_grasps(hand, "can", 2))
+    assert TABLE in there.extra
+    assert TABLE not in GraspProblem(hand, obj).on_table(there).extra
