@@ -204,7 +204,7 @@ class Generate:
         size = TOGETHER if on_accelerator(self.device) else 1
         return [jobs[start : start + size] for start in range(0, len(jobs), size)]
 
-    def _predict(self, job: Job, names: list[str]) -> list[Predicted | DroGraspError]:
+    def _predict(self, job: Job, names: list[str]) -> list[Predicted | Nothing | DroGraspError]:
         """What is predicted of each object, or why there is nothing."""
         from dro_grasp.grasps.batch import GraspBatch
 
