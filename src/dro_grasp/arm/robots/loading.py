@@ -267,8 +267,7 @@ def _bare(path: Path) -> mujoco.MjModel:
                 spec.delete(item)
             return spec.compile()
     except HandError as error:
-        raise RobotError(f"keys and actuators of the arm cannot be read: {error}; correct the file, or state 'home' and "
-                         "the effort in 'limits'") from error
+        raise RobotError(f"keys and actuators of the arm cannot be read: {error}; correct the file") from error
 
 
 def _stated_limits(path: Path, kind: str) -> dict[str, float]:
