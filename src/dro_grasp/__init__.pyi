@@ -82,7 +82,7 @@ from .simulation.contacts import ContactQuality as ContactQuality, measure_conta
 from .simulation.forces import GraspForces as GraspForces, find_forces as find_forces
 from .simulation.holding import expect_hold as expect_hold
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
-from .simulation.protocols import PROTOCOLS as PROTOCOLS, Perturbations as Perturbations, Protocol as Protocol
+from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol, protocol as protocol
 from .simulation.trial import simulate as simulate
 from .training.config import (
     AugmentationConfig as AugmentationConfig,

@@ -84,8 +84,6 @@ def test_the_command_trains_the_placement_alone(
     assert main(command) == 2
     assert main([*command, "--initial", str(first), "--pretrained", str(first)]) == 2
     assert capsys.readouterr().err.count("name them with --initial") == 2
-    assert main([*command, "--initial", str(first), "--preset", "slim"]) == 2
-    assert "decides the form of the network, and --preset slim states one, too" in capsys.readouterr().err
     whole = [word for word in command if word not in ("--part", "placement")]
     assert main([*whole, "--initial", str(first), "--pretrained", str(first)]) == 2
     assert "both give the hand encoder" in capsys.readouterr().err

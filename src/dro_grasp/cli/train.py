@@ -48,13 +48,11 @@ class Stage:
     json: Flag = False  # Print one JSON object at the end.
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
-        """The configuration of the initial weights, or else of the preset; OptionError: both are given."""
+        """The configuration of the preset, else of the initial weights, else of `multi`."""
         from dro_grasp.network.presets import NetworkConfig
 
-        if initial is not None and self.preset is not None:
-            raise OptionError(f"--initial {self.initial} decides the form of the network, and --preset {self.preset} states "
-                              "one, too; leave one of them out")
-        return NetworkConfig.preset(self.preset or "multi") if initial is None else initial.config
+        given = None if initial is None or self.preset is not None else initial.config
+        return given or NetworkConfig.preset(self.preset or "multi")
 
     def schedule(self, **more: Any) -> ScheduleConfig:
         """The schedule, which can be carried out here."""
