@@ -8,6 +8,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +78,7 @@ class GraspPredictor:
         >>> grasps = dro.GraspPredictor().predict(hand, obj, num=16)
     """
 
-    def __init__(self, weights: str | None = None, device: str = "cpu", config: PredictorConfig | None = None) -> None:
+    def __init__(self, weights: str | Path | None = None, device: str = "cpu", config: PredictorConfig | None = None) -> None:
         """Load the weights once.
 
         Args:
