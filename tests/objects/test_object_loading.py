@@ -87,6 +87,30 @@ def test_buffers_of_a_gltf_lie_beside_it(tmp_path: Path, name: str) -> None:
         load_file(path)
 
 
+@pytest.mark.parametrize(("change", "told"), [({"normalized": True}, "without quantization"),
+                                              ({"sparse": {"count": 1}}, "without sparse accessors")])
+def test_vertices_of_a_gltf_that_would_be_misread_are_refused(tmp_path: Path, change: dict[str, Any], told: str) -> None:
+    path, content = gltf(tmp_path)
+    content["accessors"][content["meshes"][0]["primitives"][0]["attributes"]["POSITION"]] |= change
+    path.write_text(json.dumps(content))
+    with pytest.raises(ObjectError, match=told):
+        load_file(path)
+
+
+@pytest.mark.parametrize("corner", ["{v}", "{v}//{n}", "{v}/{t}/{n}", "{v}/{t}"])
+def test_negative_indices_of_an_obj_count_from_the_last_line_so_far(tmp_path: Path, corner: str) -> None:
+    lines = []
+    for at in (0.0, 0.052):
+        box = trimesh.creation.box((0.04, 0.05, 0.06)).apply_translation((at, 0, 0))
+        for x, y, z in box.vertices:
+            lines += [f"v {x} {y} {z}", "vt 0 0", "vn 0 0 1"]
+        lines += ["f " + " ".join(corner.format(v=i - 8, t=i - 8, n=i - 8) for i in face) for face in box.faces]
+    (tmp_path / "two.obj").write_text("\n".join(lines))
+    obj = load_file(tmp_path / "two.obj")
+    assert obj.volume == pytest.approx(2 * 0.04 * 0.05 * 0.06, rel=1e-5)
+    assert obj.extents[0] == pytest.approx(0.092, abs=1e-6)
+
+
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 @pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
 def test_compressed_meshes_of_a_gltf_are_told(tmp_path: Path, suffix: str, name: str) -> None:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -42,6 +44,8 @@ MAX_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes 
 POINTER = b"version https://git-lfs.github.com/spec/"  # How such files begin. Source: specification of Git LFS, version 1
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 """Extensions of glTF by which meshes are compressed. Source: glTF's registry of extensions."""
+OBJ_LINES = (b"v", b"vt", b"vn")
+"""Lines of an OBJ file that the indices of a face's corner count, in their order. Source: OBJ's specification."""
 FETCH = "fetch the file itself: git lfs pull, in its repository"
 """What to do about a pointer."""
 
@@ -50,20 +54,53 @@ def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
     """What trimesh reads from a file, without materials and textures; each reader behind it raises its own errors."""
     check_bytes(path)
     kind, data = path.suffix.lower().removeprefix("."), path.read_bytes()
-    _refuse_compressed(data, kind)
+    _refuse_what_is_misread(data, kind)
+    if kind == "obj":
+        data = _counted_from_the_first(data)
     # From memory: lengths that a header claims then end with the file, instead of asking for as much.
     with io.BytesIO(data) as content:
         return trimesh.load(content, kind, skip_materials=True, resolver=Beside(path.parent), **options)
 
 
-def _refuse_compressed(data: bytes, kind: str) -> None:
-    """Refuse a glTF whose meshes are compressed, by a ValueError: trimesh reads one point of each."""
+def _refuse_what_is_misread(data: bytes, kind: str) -> None:
+    """Refuse a glTF of whose vertices trimesh reads other numbers than the file states, by a ValueError."""
     if kind != "gltf" and not (kind == "glb" and data.startswith(b"glTF")):
         return
     content = json.loads(data if kind == "gltf" else data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    required = content.get("extensionsRequired", []) if isinstance(content, dict) else []
-    if found := [name for name in COMPRESSED if name in required]:
+    if not isinstance(content, dict):
+        return
+    if found := [name for name in COMPRESSED if name in content.get("extensionsRequired", [])]:
         raise ValueError(f"its meshes are compressed ({found[0]}); export it without compression")
+    accessors = content.get("accessors", [])
+    used = {index for mesh in content.get("meshes", []) for part in mesh["primitives"]
+            for index in (part.get("indices"), part["attributes"].get("POSITION")) if index is not None}
+    for accessor in (accessors[index] for index in used if index < len(accessors)):
+        if accessor.get("normalized"):
+            raise ValueError("its vertices are integers that stand for fractions (KHR_mesh_quantization); export it without "
+                             "quantization")
+        if "sparse" in accessor:
+            raise ValueError("its vertices or faces are stored as sparse differences; export it without sparse accessors")
+
+
+def _counted_from_the_first(data: bytes) -> bytes:
+    """An OBJ file whose faces have no negative indices, which count from the last line so far, not from the file's last."""
+    if not re.search(rb"^[ \t]*f[ \t].*-", data, re.MULTILINE):
+        return data
+    so_far, lines = Counter[bytes](), list[bytes]()
+    for line in data.splitlines():
+        first, *words = line.split() or [b""]
+        so_far[first] += 1
+        if first == b"f":
+            corners = ([_counted(index, so_far[kind]) for index, kind in zip(word.split(b"/"), OBJ_LINES, strict=False)]
+                       for word in words)
+            line = b" ".join([first, *(b"/".join(corner) for corner in corners)])
+        lines.append(line)
+    return b"\n".join(lines)
+
+
+def _counted(index: bytes, so_far: int) -> bytes:
+    """An index from 1, of one that may count from the last: -1 is the last."""
+    return b"%d" % (so_far + 1 + int(index)) if index.startswith(b"-") else index
 
 
 def is_pointer(path: Path) -> bool:
