@@ -16,7 +16,7 @@ from dro_grasp.cli.generate import paths_per_object
 from dro_grasp.cli.main import main, parse
 from dro_grasp.errors import GraspFileError, NoGraspError
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
-from dro_grasp.grasps.sources import object_of, with_own_files
+from dro_grasp.grasps.sources import object_file, object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.predictor import GraspPredictor
@@ -109,6 +109,32 @@ def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
     grasps = load_grasps(tmp_path)
     assert dict(zip(grasps.object, grasps.object_sha256, strict=True)) == expected
     assert main(["evaluate", str(tmp_path)]) == 0
+
+
+def test_one_built_in_object_of_two_sizes_is_evaluated_from_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hand = loaded_hand("gripper3")
+    for scale in (1.0, 0.8):
+        obj = load_object("brick", scale=scale)
+        with_own_files(palm_facing_starts(hand, obj, num=1, seed=0), hand, obj).save(tmp_path / f"scale_{scale:g}.parquet")
+    assert main(["evaluate", str(tmp_path), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "were made for another" not in said.err
+    assert set(json.loads(said.out)["objects"]) == {"scale_1", "scale_0.8"}
+
+
+def test_a_file_of_an_objects_name_in_the_folder_is_not_taken_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mesh = trimesh.creation.box((0.05, 0.05, 0.08))
+    (tmp_path / "brick").write_text("notes")
+    (tmp_path / "mesh").write_text("notes")
+    hand = loaded_hand("gripper3")
+    for obj in (load_object("brick"), load_object(mesh)):
+        assert obj.name in {"brick", "mesh"}
+        grasps = with_own_files(palm_facing_starts(hand, obj, num=1, seed=0), hand, obj)
+        assert "object_file" not in grasps.extra
+    assert object_file("brick") is None
 
 
 def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(

@@ -382,6 +382,7 @@ def _folder(folder: Path) -> GraspBatch:
 
 
 def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
+    """Batches in which objects of one name that are not the same are called as their files, and found by what they record."""
     versions: dict[str, set[str]] = {}
     for _, batch in batches:
         for name, sha256 in zip(batch.object, batch.object_sha256, strict=True):
@@ -391,7 +392,12 @@ def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
             return stem if len(versions.get(name, ())) > 1 else name
 
         asked_of = {(label(name), sha256): num for (name, sha256), num in batch.asked_of.items()}
-        yield batch.replace(object=tuple(map(label, batch.object)), asked_of=asked_of)
+        labels, extra = tuple(map(label, batch.object)), dict(batch.extra)
+        if labels != batch.object:
+            files = extra.get(columns.OBJECT_FILE, ("",) * len(batch))
+            extra[columns.OBJECT_FILE] = tuple(
+                file or (name if name != new else "") for file, name, new in zip(files, batch.object, labels, strict=True))
+        yield batch.replace(object=labels, asked_of=asked_of, extra=extra)
 
 
 DUPLICATE_DISTANCE = 0.005  # Two posed hands whose surface points lie closer together on average count as one grasp [m] (ours)

@@ -52,10 +52,11 @@ def hand_file(hand: str) -> str | None:
 
 def object_file(obj: str) -> str | None:
     """The file of an object, or its folder of DexGraspBench, if it was given by its path."""
-    from dro_grasp.objects.catalogue import processed_folder
+    from dro_grasp.objects.catalogue import is_object_name, processed_folder
 
     path = given_path(obj)
-    return str(path.resolve()) if path.is_file() or processed_folder(path) is not None else None
+    own = not is_object_name(obj) and (path.is_file() or processed_folder(path) is not None)
+    return str(path.resolve()) if own else None
 
 
 def recorded(
@@ -92,8 +93,8 @@ def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBat
     own = read is not None and hand.name == read.name and read.path.parent != BUILTIN_FOLDER
     grasps = with_mass_of(grasps, obj)
     taken = obj if obj.is_cloud and obj.file is None else None
-    return with_sources(
-        grasps, read.source if read is not None and own else hand.name, obj.file or obj.name, obj.scale, taken=taken)
+    return recorded(grasps, hand_file(read.source if read is not None and own else hand.name),
+                    None if obj.file is None else object_file(obj.file), obj.scale, taken=taken)
 
 
 def with_mass_of(grasps: GraspBatch, obj: ObjectModel) -> GraspBatch:
@@ -157,7 +158,7 @@ def _object_of(grasps: GraspBatch, given: str | None, scale: float | None) -> Ob
     from dro_grasp.objects.catalogue import load_object
 
     if given is not None:
-        recorded_scale = object_source(grasps)[1] if given_path(given).is_file() else 1.0
+        recorded_scale = 1.0 if object_file(given) is None else object_source(grasps)[1]
         return load_object(given, scale=recorded_scale if scale is None else scale)
     if (taken := _recorded(grasps, OBJECT_CLOUD)) is not None:
         return unpacked_cloud(taken, grasps.object[0])

@@ -91,6 +91,11 @@ def locate_object(name: str) -> tuple[Path, str]:
     return path, path.name if path.is_dir() else path.stem
 
 
+def is_object_name(text: str) -> bool:
+    """Whether `load_object` takes a text for the name of an object, even where there is a file of that name."""
+    return text in BUILTIN or bool(PROCEDURAL.fullmatch(text)) or text.removeprefix(ASSET_PREFIX) in _assets()
+
+
 def object_names() -> dict[str, str]:
     """Names that `load_object` takes, with their split."""
     assets = {name: entry["multidex_split"] or "extra" for name, entry in _assets().items()}
