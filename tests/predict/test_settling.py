@@ -28,6 +28,7 @@ from dro_grasp.predict.settling import (
     DEEP,
     FORBIDDEN,
     GIVES_WAY,
+    HARSH,
     JAMMED,
     SettleConfig,
     Settled,
@@ -179,17 +180,18 @@ def test_doubts_say_what_closing_showed(outcome: Settled) -> None:
     gave, state = outcome.known.state.gave.clone(), outcome.known.state
     gave[rows] = torch.tensor([[0.0, 0.0], [0.021, 0.0], [0.0, math.radians(16)]])
     wrong = torch.zeros_like(outcome.stable).index_fill(0, rows[:1], True)
-    found = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong, outcome.jammed, SettleConfig())
+    found = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong, outcome.against, SettleConfig())
     assert [found[i] for i in rows] == [FORBIDDEN, GIVES_WAY, GIVES_WAY]
     for why, moved, stable in zip(found, outcome.known.moved, outcome.stable, strict=True):
         assert (why == AWAY) == (not moved < 0.05)
         assert stable or why
     assert AWAY in found
     gave[rows] = 0.0
-    held = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong & False, outcome.jammed, SettleConfig())
+    held = doubts(replace(outcome.known, state=replace(state, gave=gave)), wrong & False, outcome.against, SettleConfig())
     assert [held[i] for i in rows] == [""] * 3
-    jammed = doubts(outcome.known, wrong & False, torch.ones_like(wrong), SettleConfig())
-    assert {jammed[i] for i in rows} == {JAMMED}
+    for why in (JAMMED, HARSH):
+        against = outcome.against | {why: torch.ones_like(wrong)}
+        assert {doubts(outcome.known, wrong & False, against, SettleConfig())[i] for i in rows} == {why}
 
 
 def test_effort_is_that_of_the_joint_that_is_nearest_to_its_limit() -> None:
@@ -260,8 +262,8 @@ def test_what_no_torque_of_the_joints_explains_is_jammed() -> None:
     torque = torch.zeros(4, HAND.tree.n_dof)
     torque[1:, :2] = torch.tensor([0.1, -0.1])
     most = torch.tensor([0.0, 10.0, 10.0, 10.0]) + 4 * 9.81 + 5
-    squeeze = Squeeze(torque, most + torch.tensor([-0.1, -0.1, 0.1, 100.0]))
+    squeeze = Squeeze(torque, most + torch.tensor([-0.1, -0.1, 0.1, 100.0]), torch.zeros(4))
     assert bool(HAND.movable[:2].all())
     assert is_jammed(HAND, 1.0, squeeze, 0.02).tolist() == [False, False, True, True]
     sliding = HAND.tree.joint_unit
-    assert is_jammed(HAND, 1.0, Squeeze(torque / sliding, squeeze.force), 0.02).tolist() == [False, False, True, True]
+    assert is_jammed(HAND, 1.0, Squeeze(torque / sliding, squeeze.force, squeeze.hardest), 0.02).tolist() == [False, False, True, True]

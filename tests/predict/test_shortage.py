@@ -20,12 +20,12 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict import finish
-from dro_grasp.predict.config import PredictorConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import AWAY, GIVES_WAY
+from dro_grasp.predict.settling import AWAY, GIVES_WAY, HARSH
 from dro_grasp.predict.shortage import Tally, find_misfits, fingertip_forces, fingertip_range, principal_axes
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
@@ -147,7 +147,22 @@ def test_limits_of_forces_are_named_where_grasps_give_way(jaws: Hand, tmp_path: 
     problem = GraspProblem(jaws, box(tmp_path, 0.05, 0.05, 0.2), constraints=limits)
     words = Tally(0, 20, {}, {GIVES_WAY: 9}, 0.1).in_words(problem, 4, alone=False)
     assert "or allow more max_force (now 1 N); or ask for a smaller margin (now 5)" in words
+    assert "allow more max_force" in Tally(0, 20, {}, {HARSH: 9}, 0.1).in_words(problem, 4, alone=False)
     assert "max_force" not in Tally(0, 20, {}, {AWAY: 9}, 0.1).in_words(problem, 4, alone=False)
+
+
+def test_counts_of_a_shortage_add_up(jaws: Hand, tmp_path: Path) -> None:
+    problem = GraspProblem(jaws, box(tmp_path, 0.2, 0.2, 0.2), constraints=Constraints(direction=(0.0, 0.0, -1.0)))
+    with pytest.raises(NoGraspError) as caught:
+        GraspPredictor(untrained_weights(tmp_path), config=PredictorConfig(finish=FinishConfig(least_confidence=LEAST))).run(
+            problem, GraspRequest(4, candidates=8, source="network"))
+    words = str(caught.value)
+    patterns = {"made": r"of (\d+) candidates", "found": r"only (\d+) of", "doubted": r"(\d+) hold with a probability",
+                "unsettled": r"The (\d+) that ranked lowest were not closed in simulation"}
+    counts = {name: sum(map(int, re.findall(pattern, words))) for name, pattern in patterns.items()}
+    dropped = sum(int(count) for part in re.findall(r"\(dropped: (.*?)\)", words) for count in re.findall(r"\d+(?= [a-z])", part))
+    assert counts["made"] == counts["found"] + counts["doubted"] + counts["unsettled"] + dropped, words
+    assert counts["unsettled"] > 0
 
 
 @pytest.fixture(scope="module")

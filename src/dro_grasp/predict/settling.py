@@ -43,9 +43,10 @@ DEEP = "reach into it"  # The hand is too deep in the object, or in itself
 JAMMED = "jam it between parts that do not move"  # No torque of the joints explains how hard it is pressed
 MOVES = "move it as they close"  # The second closing moves the object too far
 TURNS = "turn it as they close"  # It turns it too far
+HARSH = "press it harder than max_force"  # A link presses harder than the constraints allow
 FORBIDDEN = "end where the constraints forbid"  # What closing left violates a constraint
 GIVES_WAY = "give way under its weight"  # The weight then moves or turns the object farther than the protocol allows
-DOUBTS = (AWAY, DEEP, JAMMED, MOVES, TURNS, FORBIDDEN, GIVES_WAY)
+DOUBTS = (AWAY, DEEP, JAMMED, MOVES, TURNS, HARSH, FORBIDDEN, GIVES_WAY)
 """What closing shows against a grasp, in the order in which the first is told."""
 WEIGHTS = 4.0  # Weights of the object by which it may be pressed without any torque (ours)
 SLIGHT = 5.0  # Force that counts as nothing [N] (ours)
@@ -119,7 +120,7 @@ class Settled(NamedTuple):
     grasps: GraspBatch  # all of them, in their order
     stable: Bool[Tensor, " n"]  # which ones hold still, with no link too deep in the object or in another
     known: Evidence  # what closing showed of all of them
-    jammed: Bool[Tensor, " n"]  # which ones no torque of the joints explains
+    against: dict[str, Bool[Tensor, " n"]]  # which ones are JAMMED or HARSH
 
 
 def can_settle(problem: GraspProblem) -> bool:
@@ -159,7 +160,7 @@ def settle_best_all(
     wrong = [~feasible(problem, own.grasps, admission) for problem, own in zip(problems, settled, strict=True)]
     closed = [replaced(own.grasps, off, before[off]) for own, off, before in zip(settled, wrong, some, strict=True)]
     known = score_all(problems, closed, score)
-    return [SettledBest(best, _judged_by(problem, grasps, own, off, config), doubts(own.known, off, own.jammed, config))
+    return [SettledBest(best, _judged_by(problem, grasps, own, off, config), doubts(own.known, off, own.against, config))
             for problem, best, grasps, own, off in zip(problems, chosen, known, settled, wrong, strict=True)]
 
 
@@ -185,13 +186,12 @@ def _judged_by(
 
 
 def doubts(
-    known: Evidence, wrong: Bool[Tensor, " n"], jammed: Bool[Tensor, " n"], config: SettleConfig
+    known: Evidence, wrong: Bool[Tensor, " n"], against: dict[str, Bool[Tensor, " n"]], config: SettleConfig
 ) -> tuple[str, ...]:
     """What closing showed against each grasp, in words; empty for nothing."""
     state = known.state
-    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, JAMMED: jammed,
-             MOVES: state.shift >= config.farthest, TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong,
-             GIVES_WAY: gives_way(state)}
+    found = {AWAY: ~(known.moved < config.lost), DEEP: known.depth >= config.deepest, MOVES: state.shift >= config.farthest,
+             TURNS: state.turn >= config.largest_turn, FORBIDDEN: wrong, GIVES_WAY: gives_way(state), **against}
     return tuple(next((words for words in DOUBTS if found[words][i]), "") for i in range(len(wrong)))
 
 
@@ -202,9 +202,9 @@ def settle_all(
 
     Each hand closes three times. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
     forces; where it moves, the grasp is refined there. The second time it gets its place, and a squeeze for the weight. A
-    grasp that the last time still moves the object, loses it, or lets links penetrate too deep is returned as it was. Payloads
-    are of those that hold and do not give way under the weight. What lies flat on a table is closed on from where the grasp
-    is, with several squeezes.
+    grasp that the last time still moves the object, loses it, presses it harder than is allowed, or lets links penetrate too
+    deep is returned as it was. Payloads are of those that hold and do not give way under the weight. What lies flat on a table
+    is closed on from where the grasp is, with several squeezes.
 
     Args:
         problems: One hand, and objects; see `can_settle`.
@@ -303,14 +303,17 @@ def _judged(
     """The grasps, of these rows the better ones that hold still, and what closing showed."""
     hand, obj = problem.hand, problem.solid
     depth = torch.maximum(deepest_penetration(hand, obj, better, config.protocol), state.pierced)
-    jam = is_jammed(hand, obj.mass, squeeze, config.shortest_lever)
-    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest) & ~jam
+    most = problem.constraints.max_force
+    against = {JAMMED: is_jammed(hand, obj.mass, squeeze, config.shortest_lever),
+               HARSH: squeeze.hardest > (math.inf if most is None else most)}
+    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
+    holds &= ~torch.stack([*against.values()]).any(0)
     stable = torch.zeros_like(moved, dtype=torch.bool).index_fill(0, rows[holds], True)
     payload = observed(better.payload, state.gave, config.weight.pull * obj.mass, config.protocol)
     better = better.replace(squeeze_torque=squeeze.torque, squeeze_force=squeeze.force, payload=payload)
     known = Evidence.none(len(grasps), obj.mass).known(rows, depth, effort_share(hand, squeeze.torque), state)
-    jammed = torch.zeros_like(stable).index_fill(0, rows[jam], True)
-    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable), jammed)
+    whole = {why: torch.zeros_like(stable).index_fill(0, rows[own], True) for why, own in against.items()}
+    return Settled(replaced(grasps, stable, better[holds]), stable, replace(known, moved=moved, stable=stable), whole)
 
 
 def weigh_settled_all(

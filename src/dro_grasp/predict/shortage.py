@@ -19,7 +19,7 @@ from dro_grasp.objects.scenery import Scene
 from dro_grasp.predict.admission import PLANE, dropped_in_words
 from dro_grasp.predict.finish import Finished
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import GIVES_WAY
+from dro_grasp.predict.settling import GIVES_WAY, HARSH
 from dro_grasp.simulation.protocols import CARRY
 
 POSTURES = 17  # Postures from open to closed in which fingertips are compared (ours)
@@ -49,7 +49,8 @@ def shortage_in_words(problem: GraspProblem, asked: int, done: Finished | None, 
         alone: Whether one source alone was asked for.
     """
     tally = Tally() if done is None else Tally(
-        int(done.trusted.sum()), done.made, done.dropped, done.doubted, done.config.least_confidence)
+        int(done.trusted.sum()), done.made, done.dropped, done.doubted, done.config.least_confidence,
+        done.made - sum(done.dropped.values()) - len(done.pool))
     return tally.in_words(problem, asked, alone)
 
 
@@ -67,6 +68,8 @@ class Tally:
     """Candidates below the least confidence, by what closing showed against them."""
     least_confidence: float = 0.0
     """What was demanded of them."""
+    unsettled: int = 0
+    """Candidates that ranked too low to be closed in simulation."""
 
     def in_words(self, problem: GraspProblem, asked: int, alone: bool) -> str:
         """As `shortage_in_words`."""
@@ -76,7 +79,7 @@ class Tally:
         steps = [*dict.fromkeys(misfit.remedy for misfit in misfits)]
         if not steps:
             steps.append("try another seed")
-        steps += firmer(problem) if self.doubted.get(GIVES_WAY) else []
+        steps += firmer(problem) if self.doubted.get(GIVES_WAY) or self.doubted.get(HARSH) else []
         steps += advice(problem, self.dropped) + (["use the source 'auto'"] if alone else [])
         if doubted:
             steps.append("see the doubtful ones with least_confidence=0")
@@ -85,6 +88,8 @@ class Tally:
         if doubted:
             told += (f"{doubted} hold with a probability below {100 * self.least_confidence:.0f} %"
                      f"{dropped_in_words(self._fates(), 'fingers ')}. ")
+        if self.unsettled:
+            told += f"The {self.unsettled} that ranked lowest were not closed in simulation. "
         told += "".join(f"{misfit.fact}. " for misfit in misfits)
         last = "; or ".join(steps)
         return told + last[0].upper() + last[1:]

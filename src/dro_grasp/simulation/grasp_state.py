@@ -88,6 +88,7 @@ class Squeeze(Rows):
 
     torque: Float[Tensor, "n n_dof"]  # what the servos exert [Nm or N]
     force: Float[Tensor, " n"]  # sum of the normal forces on the object [N]
+    hardest: Float[Tensor, " n"]  # that of the link that presses hardest [N]
 
 
 def press(
@@ -158,11 +159,12 @@ def grasp_state_many(
     scenes = [scene_of(hand, obj, grasps, protocol) for obj, grasps in zip(objects, batches, strict=True)]
     none = {f.name: torch.zeros(0, 2) if f.name in PAIRS else torch.zeros(0) for f in fields(GraspState)}
     joints, config = batches[0].joints[:0], config or WeightConfig()
-    parts, squeezes = [GraspState(**none)], [Squeeze(joints, joints.new_zeros(0))]
+    parts, squeezes = [GraspState(**none)], [Squeeze(joints, joints.new_zeros(0), joints.new_zeros(0))]
     for part, rollout in rollouts_of_all(scenes, hand, batches, workers, device=device):
-        closed, state = _observed(rollout)
+        closed, state, hardest = _observed(rollout)
         reached = torch.from_numpy(rollout.poses()[0]).to(part.joints)
-        squeezes.append(Squeeze(servo_torques(hand, reached, part.squeeze_joints, rollout.scene.protocol), state.pressure))
+        torque = servo_torques(hand, reached, part.squeeze_joints, rollout.scene.protocol)
+        squeezes.append(Squeeze(torque, state.pressure, hardest))
         parts.append(replace(state, gave=_pulled(rollout, closed, config)))
     return join(parts), join(squeezes)
 
@@ -211,7 +213,8 @@ def _pulled(rollout: Rollout, closed: ObjectState, config: WeightConfig) -> Floa
     return torch.from_numpy(gave).float()
 
 
-def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
+def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState, Float[Tensor, " n"]]:
+    """The object after closing, what holds it, and the normal force of the link that presses hardest [N]."""
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
@@ -226,7 +229,8 @@ def _observed(rollout: Rollout) -> tuple[ObjectState, GraspState]:
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
     missing = unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32).to(rollout.place), friction).cpu()
-    return closed, GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan))
+    state = GraspState(**values, unanswered=missing, gave=torch.full_like(missing, torch.nan))
+    return closed, state, torch.tensor([c.hardest_link for c in found], dtype=torch.float32)
 
 
 @dataclass(frozen=True)
