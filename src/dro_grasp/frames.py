@@ -16,6 +16,7 @@ from dro_grasp.files import FRAME_FILE, given_path, require_known
 
 HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")  # Names of the half-axes, in the order of the indices of `half_axis`
 ROUNDING = 1e-3  # Largest deviation of a rotation's product with its transpose from the identity (ours)
+LAST_ROW = 1e-6  # Largest deviation of the last row from 0 0 0 1 (ours): products of matrices round
 LONGEST_TRANSLATION = 100.0  # A longer translation must be in another unit [m] (ours)
 
 
@@ -61,6 +62,7 @@ def read_motion(path: Path, key: str) -> NamedMotion:
         raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name on one line")
     if (fault := motion_fault(T)) is not None:
         raise OptionError(f"{wanted}; {fault}")
+    T[3] = T.new_tensor([0, 0, 0, 1])
     return NamedMotion(name, T.float())
 
 
@@ -79,7 +81,7 @@ def motion_fault(T: Float[Tensor, "*any"]) -> str | None:
     """Why a matrix is no rigid motion in metres, in words; None if it is one."""
     if not bool(T.isfinite().all()):
         return "its matrix holds NaN or infinity"
-    if T.shape != (4, 4) or T[3].tolist() != [0, 0, 0, 1]:
+    if T.shape != (4, 4) or not bool((T[3] - T.new_tensor([0, 0, 0, 1])).abs().max() <= LAST_ROW):
         return f"its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1"
     if not bool(are_rotations(T[:3, :3])):
         return "the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)"

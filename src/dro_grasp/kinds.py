@@ -6,7 +6,9 @@ import dataclasses
 import functools
 import inspect
 import operator
+import sys
 from collections.abc import Callable
+from numbers import Real
 from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -59,6 +61,11 @@ def require_seed(seed: int, bits: int = 63) -> None:
     """Refuse a seed of random numbers that does not fit into so many bits, or is negative: OptionError."""
     if not 0 <= seed < 2**bits:
         raise OptionError(f"seed is {seed}; give an integer from 0 to 2^{bits} - 1")
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a finite number, and no truth value."""
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def plain(name: str, given: Any, kind: Any) -> Any:

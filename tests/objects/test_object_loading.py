@@ -97,6 +97,14 @@ def test_vertices_of_a_gltf_that_would_be_misread_are_refused(tmp_path: Path, ch
         load_file(path)
 
 
+def test_an_off_file_of_polygons_is_told_to_be_exported_in_triangles(tmp_path: Path) -> None:
+    faces = ["5 0 1 2 3 4", "3 0 1 5", "3 1 2 5", "3 2 3 5", "3 3 4 5", "3 4 0 5"]
+    corners = [f"{0.05 * np.cos(a):.6f} {0.05 * np.sin(a):.6f} 0" for a in np.arange(5) * 2 * np.pi / 5]
+    (tmp_path / "cone.off").write_text("\n".join(["OFF", "6 6 0", *corners, "0 0 0.06", *faces]) + "\n")
+    with pytest.raises(ObjectError, match="its faces have unequal numbers of corners; export it in triangles"):
+        load_file(tmp_path / "cone.off")
+
+
 @pytest.mark.parametrize("corner", ["{v}", "{v}//{n}", "{v}/{t}/{n}", "{v}/{t}"])
 def test_negative_indices_of_an_obj_count_from_the_last_line_so_far(tmp_path: Path, corner: str) -> None:
     lines = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,15 @@ def lzf(data: bytes) -> bytes:
     return bytes(packed)
 
 
+@pytest.mark.parametrize("write", [str.lower, str.upper])
+def test_keys_of_a_pcd_are_read_in_small_letters_and_capitals(tmp_path: Path, write: Callable[[str], str]) -> None:
+    head = ["VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "WIDTH 300", "HEIGHT 1", "POINTS 300", "DATA ascii"]
+    keys = [" ".join([write(line.split()[0]), *line.split()[1:]]) for line in head[:-1]] + [write(head[-1])]
+    rows = [" ".join(f"{value:.6f}" for value in point) for point in 0.04 * directions(300)]
+    (tmp_path / "c.pcd").write_text("\n".join(keys + rows) + "\n")
+    assert len(load_file(tmp_path / "c.pcd").cloud) == 300
+
+
 @pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
 @pytest.mark.parametrize("width", [3, 6])
 def test_cloud_from_pcd(tmp_path: Path, kind: str, width: int):
@@ -159,6 +169,16 @@ def test_npy_with_objects_or_noise_is_refused(tmp_path: Path):
     (tmp_path / "c.npy").write_bytes(b"")
     with pytest.raises(ObjectError, match="expected a plain NPY array"):
         load_file(tmp_path / "c.npy")
+
+
+def test_points_on_one_line_are_no_object(tmp_path: Path) -> None:
+    """They may be a slider's or a laser's; a planar cloud is taken, and so is a thin wire."""
+    along = np.linspace(0, 0.2, 100)[:, None] * (0.6, 0.8, 0)
+    np.save(tmp_path / "c.npy", along)
+    with pytest.raises(ObjectError, match="100 points of .* lie on one line"):
+        load_file(tmp_path / "c.npy")
+    np.save(tmp_path / "c.npy", along + 5e-4 * directions(100))
+    assert len(load_file(tmp_path / "c.npy").cloud) == 100
 
 
 def test_planar_cloud_works(tmp_path: Path):

@@ -59,7 +59,12 @@ def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
         data = _counted_from_the_first(data)
     # From memory: lengths that a header claims then end with the file, instead of asking for as much.
     with io.BytesIO(data) as content:
-        return trimesh.load(content, kind, skip_materials=True, resolver=Beside(path.parent), **options)
+        try:
+            return trimesh.load(content, kind, skip_materials=True, resolver=Beside(path.parent), **options)
+        except TypeError as error:
+            if kind != "off":
+                raise
+            raise ValueError("its faces have unequal numbers of corners; export it in triangles") from error
 
 
 def _refuse_what_is_misread(data: bytes, kind: str) -> None:

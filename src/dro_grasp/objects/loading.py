@@ -34,6 +34,7 @@ UNIT_OF = {".stl": "millimetres", ".3mf": "millimetres", ".off": "millimetres", 
 FARTHEST_VIEW = 20.0  # Largest extent of a view of a depth camera [m] (ours)
 FARTHEST = 100.0  # Largest coordinate [m] (ours): single precision rounds it by 4 micrometres
 MIN_CLOUD = 16  # Fewest distinct points of a bare cloud (ours)
+LINE = 1e-5  # Root mean square distance of points from a line up to which they lie on it [m] (ours)
 ONE_SIDED = 0.3  # Mean of the normals above which a cloud is one side of an object [1] (ours)
 ONE_COLOUR = 0.999  # Length of the mean of unit vectors from which on they are one vector for all points [1] (ours)
 NEIGHBOURS = 16  # Neighbours that estimate the normals of a bare cloud (ours)
@@ -133,6 +134,8 @@ def cloud_object(
     if len(xyz) < MIN_CLOUD:
         raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
+    if np.linalg.svd(xyz - xyz.mean(0), compute_uv=False)[1] < LINE * math.sqrt(len(xyz)):
+        raise ObjectError(f"the {len(xyz)} points of {origin} lie on one line; give a cloud of the object's surface")
     cloud = np.ascontiguousarray(xyz[keep], np.float32)
     normals, odd = given_normals(cloud, points[keep, 3:], origin, named_normals)
     has_normals = normals is not None

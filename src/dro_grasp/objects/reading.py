@@ -56,8 +56,14 @@ def in_rows(cloud: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
 
 
 def is_image(array: Shaped[np.ndarray, "..."]) -> bool:
-    """Whether an array is an image, and no list of points."""
-    return array.ndim == 2 and array.shape[1] >= NARROWEST
+    """Whether an array is an image of one channel, and no list of points."""
+    image = one_channel(array)
+    return image.ndim == 2 and image.shape[1] >= NARROWEST
+
+
+def one_channel(image: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+    """An image of one channel (h, w, 1) as rows and columns (h, w); other arrays as they are."""
+    return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
 
 
 def refuse_image(array: Shaped[np.ndarray, "..."], origin: str) -> None:
@@ -191,7 +197,7 @@ def _read_pcd(path: Path) -> Float[np.ndarray, "... columns"]:
     """Points, and normals if there are any, in rows and columns if they are an image's. A field may take several (COUNT)."""
     raw = path.read_bytes()
     header, start = _pcd_header(raw, path)
-    fields, kind = header["FIELDS"], header["DATA"][0]
+    fields, kind = header["FIELDS"], header["DATA"][0].lower()
     count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     names = [*"xyz"]
     if {"normal_x", "normal_y", "normal_z"} <= set(fields):
@@ -253,5 +259,5 @@ def _pcd_header(raw: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
         words = raw[position:end].decode("ascii", "replace").split()
         position = end + 1
         if words and not words[0].startswith("#"):
-            header[words[0]] = words[1:]
+            header[words[0].upper()] = words[1:]
     return header, position

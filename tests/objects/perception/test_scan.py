@@ -254,6 +254,12 @@ def test_few_points_are_refused() -> None:
         scanned_object("crumbs", np.random.default_rng(0).normal(size=(3, 3)))
 
 
+def test_images_of_one_channel_are_images(depth: np.ndarray) -> None:
+    mask = (depth > 0) & (np.arange(SHAPE[1]) < 80)
+    np.testing.assert_array_equal(
+        depth_points(depth[..., None], INTRINSICS, mask[..., None]), depth_points(depth, INTRINSICS, mask))
+
+
 @pytest.mark.parametrize("fault", ["transposed", "mirrored", "millimetres"])
 def test_a_pose_that_is_none_is_refused(depth: np.ndarray, T_object_camera: np.ndarray, fault: str) -> None:
     """It would mirror the object, or leave it where the camera is."""

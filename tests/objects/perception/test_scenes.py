@@ -69,6 +69,48 @@ def test_a_pixel_a_mask_and_a_place_mean_the_same_thing() -> None:
     assert overlap(made, 1, by_mask.pixels) > WELL
 
 
+def test_depths_and_masks_of_one_channel_are_taken(tmp_path: Path) -> None:
+    """Networks and simulators return (h, w, 1)."""
+    made = make_scene("table", 2, 9, 1, width=160)
+    camera, depth = _saved(made, tmp_path), np.where(made.depth < 5, made.depth, 0.0)
+    np.save(tmp_path / "channel.npy", depth[..., None])
+    plain = load_scene(depth, camera=camera)
+    for source in (depth[..., None], tmp_path / "channel.npy"):
+        scene = load_scene(source, camera=camera)
+        np.testing.assert_array_equal(scene.points_seen(), plain.points_seen())
+        for mask in (made.owner == 1, (made.owner == 1)[..., None]):
+            np.testing.assert_array_equal(
+                scene.chosen(mask=mask).own, plain.chosen(mask=made.owner == 1).own)
+
+
+def test_a_mask_that_a_jpeg_blurs_is_its_brighter_half(tmp_path: Path) -> None:
+    mask = np.zeros((96, 128), bool)
+    mask[20:70, 30:90] = True
+    for kind in ("png", "jpg"):
+        Image.fromarray(255 * mask.astype(np.uint8)).save(tmp_path / f"mask.{kind}")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.jpg"), mask)
+    with Image.open(tmp_path / "mask.jpg") as blurred:
+        assert (np.array(blurred) != 0).sum() > mask.sum(), "it is blurred"
+
+
+@pytest.mark.parametrize(("given", "told"), [
+    ({"T_frame_camera": "camera"}, "T_frame_camera"), ({"T_frame_camera": [[1, 0], [0]]}, "T_frame_camera"),
+    ({"depth_unit": "0.001"}, "depth_unit is '0.001'"), ({"depth_unit": True}, "depth_unit is True"),
+    ({"intrinsics": "K"}, "intrinsics")])
+def test_cameras_of_something_else_are_refused_in_words(given: dict[str, Any], told: str) -> None:
+    with pytest.raises((OptionError, ObjectError), match=told):
+        SceneCamera(**({"T_frame_camera": np.eye(4)} | given))
+
+
+def test_a_last_row_that_products_of_matrices_leave_is_a_motions(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[3] = (1e-9, -2e-8, 0, 1 + 1e-9)
+    assert SceneCamera(T, depth_unit=np.float32(0.5)).T_frame_camera[3].tolist() == [0, 0, 0, 1]
+    (tmp_path / "pose.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T.tolist()}))
+    assert read_motion(tmp_path / "pose.json", "T_frame_camera").T[3].tolist() == [0, 0, 0, 1]
+
+
 def test_the_nearest_is_the_one_nearest_to_the_camera() -> None:
     made = make_scene("table", 3, 9, 1, width=480)
     depths = [np.nanmin(made.depth[made.owner == k]) for k in range(len(made.names))]

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from dro_grasp.arm.robots.drivers import ANGLES, LENGTHS, Drivers
 from dro_grasp.arm.robots.robot import Robot
-from dro_grasp.arm.robots.robot_file import RobotFile, is_number, quoted
+from dro_grasp.arm.robots.robot_file import RobotFile, quoted
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import MAX_TURN, mujoco_speaks_to
@@ -24,6 +24,7 @@ from dro_grasp.hands.description.reduction import NO_LIMITS
 from dro_grasp.hands.description.xml_files import parse_xml
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.kinds import is_number
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
 FARTHEST_ZERO = 10.0  # Largest stated zero of a driver of a joint that slides [m] (ours); of one that turns it is a turn

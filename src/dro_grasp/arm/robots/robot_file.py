@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +18,7 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.description.loader import named, split_part
+from dro_grasp.kinds import is_number
 
 Read = TypeVar("Read")
 POSE_KEYS = {"position", "quaternion_wxyz"}  # What a robot file states of a pose
@@ -193,8 +193,3 @@ class RobotFile:
 def quoted(names: Sequence[str]) -> str:
     """Names in quotation marks, in words."""
     return " and ".join(f"'{name}'" for name in names)
-
-
-def is_number(value: Any) -> bool:
-    """Whether an entry of a robot file is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -17,7 +17,7 @@ from dro_grasp.geometry.mesh_files import trimesh
 from dro_grasp.objects.perception.raised import around, joined_rest, raised
 from dro_grasp.objects.perception.segmentation import BACK, NOTHING, OTHER, SPECK, STRUCTURE, Segments
 from dro_grasp.objects.perception.things import place_of, size_of
-from dro_grasp.objects.reading import numbers
+from dro_grasp.objects.reading import numbers, one_channel
 
 Spot = Sequence[float] | Real[np.ndarray, "3"] | Real[Tensor, "3"]  # x, y, z [m]
 Pixel = Sequence[float] | Real[np.ndarray, "2"] | Real[Tensor, "2"]  # Column and row, from the upper left
@@ -260,7 +260,7 @@ def within(name: str, sight: Sight, mask: Any) -> Bool[np.ndarray, " n"]:
         raise OptionError(f"a mask is given, and '{name}' is a cloud without an image; give the depth image, an organised "
                           "cloud (h, w, 3), or a place (at=(X, Y, Z))")
     wanted = read_mask(Path(mask)) if isinstance(mask, str | Path) else (
-        np.nan_to_num(numbers(mask, "the mask", "biuf")) != 0)
+        np.nan_to_num(one_channel(numbers(mask, "the mask", "biuf"))) != 0)
     if wanted.shape != sight.shape:
         which = f"the mask {mask}" if isinstance(mask, str | Path) else "the mask"
         raise ObjectError(f"{which} has shape {wanted.shape}, and what the camera saw, '{name}', has {sight.shape}: rows and "

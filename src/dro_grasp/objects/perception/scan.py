@@ -27,7 +27,7 @@ from dro_grasp.objects.loading import (
     table_note,
 )
 from dro_grasp.objects.perception.things import one_thing, refuse_scene
-from dro_grasp.objects.reading import in_rows, numbers, read_rows, returned
+from dro_grasp.objects.reading import in_rows, numbers, one_channel, read_rows, returned
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 SIDES = (4 / 3, 16 / 9, 16 / 10, 5 / 4)
@@ -60,14 +60,14 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     Raises:
         ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
-    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
+    image, matrix = one_channel(numbers(depth, "the depth image")), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if image.ndim != 2:
         raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
     check_intrinsics(matrix, *image.shape)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
-        wanted = np.nan_to_num(numbers(mask, "the mask", "biuf")) != 0
+        wanted = np.nan_to_num(one_channel(numbers(mask, "the mask", "biuf"))) != 0
         if wanted.shape != image.shape:
             raise ObjectError(f"the mask has shape {wanted.shape}, the depth image {image.shape}; give one of the same size")
         valid = valid & wanted

@@ -15,9 +15,10 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.files import given_path, reading
 from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.mesh_files import check_bytes
+from dro_grasp.kinds import is_number
 from dro_grasp.objects.perception.choosing import Sight
 from dro_grasp.objects.perception.scan import NEAREST, check_depths, check_intrinsics, refuse_behind
-from dro_grasp.objects.reading import IMAGES, is_image, numbers, read_cloud, returned
+from dro_grasp.objects.reading import IMAGES, is_image, numbers, one_channel, read_cloud, returned
 
 WHOLE_UNIT = 0.001  # Unit of depths that are whole numbers [m]. Source: REP 118, ROS
 
@@ -36,19 +37,21 @@ class SceneCamera:
     """Unit of depth images [m]; by default a millimetre for whole numbers, else a metre."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings, by an OptionError."""
-        if (fault := motion_fault(torch.from_numpy(np.array(self.T_frame_camera, np.float64)))) is not None:
+        """Refuse impossible settings, by an OptionError; arrays of something else than numbers by an ObjectError."""
+        T = numbers(self.T_frame_camera, "T_frame_camera").astype(np.float64)
+        if (fault := motion_fault(torch.from_numpy(T))) is not None:
             raise OptionError(f"T_frame_camera is not the camera's pose in the frame '{self.frame}', in metres: {fault}")
         if not is_name(self.frame):
             raise OptionError(f"frame is {self.frame!r}; expected a name on one line")
-        object.__setattr__(self, "T_frame_camera", np.array(self.T_frame_camera, np.float64))
+        T[3] = 0, 0, 0, 1
+        object.__setattr__(self, "T_frame_camera", T)
         if self.intrinsics is not None:
             K = numbers(self.intrinsics, "the matrix of intrinsics").astype(np.float64)
             if K.shape != (3, 3) or not np.isfinite(K).all():
                 raise OptionError(f"intrinsics have shape {K.shape}; give 3 rows of 3 finite numbers, in pixels")
             object.__setattr__(self, "intrinsics", K)
-        if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
-            raise OptionError(f"depth_unit is {self.depth_unit}; give the metres of one count, such as 0.001")
+        if self.depth_unit is not None and not (is_number(self.depth_unit) and 0 < self.depth_unit <= 1):
+            raise OptionError(f"depth_unit is {self.depth_unit!r}; give the metres of one count, such as 0.001")
 
 
 def as_camera(camera: SceneCamera | Path | str) -> SceneCamera:
@@ -61,7 +64,7 @@ def as_camera(camera: SceneCamera | Path | str) -> SceneCamera:
     path, motion = given_path(camera), read_motion(Path(camera), "T_frame_camera")
     values = json.loads(path.read_text())  # read above
     K, unit = values.get("intrinsics"), values.get("depth_unit")
-    if unit is not None and (isinstance(unit, bool) or not isinstance(unit, int | float)):
+    if unit is not None and not is_number(unit):
         raise OptionError(f"{path} has depth_unit {unit!r}; give the metres of one count, such as 0.001")
     if K is not None:
         try:
@@ -103,11 +106,13 @@ def read_depth(path: Path, camera: SceneCamera | None) -> Num[np.ndarray, "h w"]
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    """A mask's pixels: not 0 on the object."""
+    """A mask's pixels: not 0 on the object; of a JPEG, which blurs edges, the brighter half."""
     path = given_path(path)
     with reading(path, ObjectError, "a PNG that is not black on the object alone", Exception):
         check_bytes(path)
         with Image.open(path) as image:
+            if image.format == "JPEG":
+                return np.array(image.convert("L")) > 127
             if image.mode in ("1", "L", "I", "I;16", "F"):
                 return np.array(image) != 0
             pixels = np.array(image.convert("RGBA"))
@@ -119,7 +124,7 @@ def sight_of_depth(depth: Num[np.ndarray, "..."], camera: SceneCamera | None, sc
     if camera is None or camera.intrinsics is None:
         raise OptionError(f"{origin} is a depth image; give its camera with intrinsics: a JSON file {{\"frame\": NAME, "
                           "\"T_frame_camera\": 4x4, \"intrinsics\": 3x3}")
-    image = numbers(depth, origin)
+    image = one_channel(numbers(depth, origin))
     height, width = image.shape
     check_intrinsics(camera.intrinsics, height, width)
     unit = camera.depth_unit or (WHOLE_UNIT if image.dtype.kind in "iu" else 1.0)
