@@ -87,7 +87,8 @@ def _answers(obj: ObjectModel, grasp: GraspBatch) -> tuple[list[object], torch.T
         closed.joints, closed.T_object_wrist, *_of_state(state), squeeze.torque, weigh(HAND, obj, told),
         settled.grasps.squeeze_joints, *_of_state(settled.known.state), weighed,
         *(number for trial in trials for number in _of_trial(trial)))
-    words = [settled.stable.tolist(), *(rows.tolist() for rows in settled.against.values()), *((trial.failure, trial.contact_links) for trial in trials)]
+    words = [settled.stable.tolist(), *(rows.tolist() for rows in settled.against.values()),
+             *((trial.failure, trial.contact_links) for trial in trials)]
     return words, torch.cat([number.double().flatten() for number in numbers])
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -175,7 +175,7 @@ def test_points_on_one_line_are_no_object(tmp_path: Path) -> None:
     """They may be a slider's or a laser's; a planar cloud is taken, and so is a thin wire."""
     along = np.linspace(0, 0.2, 100)[:, None] * (0.6, 0.8, 0)
     np.save(tmp_path / "c.npy", along)
-    with pytest.raises(ObjectError, match="100 points of .* lie on one line"):
+    with pytest.raises(ObjectError, match=r"100 points of .* lie on one line"):
         load_file(tmp_path / "c.npy")
     np.save(tmp_path / "c.npy", along + 5e-4 * directions(100))
     assert len(load_file(tmp_path / "c.npy").cloud) == 100

@@ -109,10 +109,11 @@ def test_what_presses_too_hard_however_gently_the_hand_closes_is_not_returned(
     settled = settle_grasps(problem, grasps)
     assert settled.against[HARSH].any()
     assert not (settled.stable & settled.against[HARSH]).any()
+    doubting = PredictorConfig(finish=finish.FinishConfig(least_confidence=0.2), rescue=RescueConfig(trusted_scores=(1.5,)))
+    predictor, request = dro.GraspPredictor(untrained_weights(tmp_path), config=doubting), GraspRequest(
+        4, candidates=2, source="optimiser")
     with pytest.raises(NoGraspError, match=r"press it harder than max_force.*allow more max_force \(now 0.02 N\)"):
-        doubting = PredictorConfig(finish=finish.FinishConfig(least_confidence=0.2), rescue=RescueConfig(trusted_scores=(1.5,)))
-        dro.GraspPredictor(untrained_weights(tmp_path), config=doubting).run(
-            problem, GraspRequest(4, candidates=2, source="optimiser"))
+        predictor.run(problem, request)
 
 
 def test_what_cannot_carry_the_mass_scores_less(grasps: dro.GraspBatch) -> None:

@@ -266,4 +266,5 @@ def test_what_no_torque_of_the_joints_explains_is_jammed() -> None:
     assert bool(HAND.movable[:2].all())
     assert is_jammed(HAND, 1.0, squeeze, 0.02).tolist() == [False, False, True, True]
     sliding = HAND.tree.joint_unit
-    assert is_jammed(HAND, 1.0, Squeeze(torque / sliding, squeeze.force, squeeze.hardest), 0.02).tolist() == [False, False, True, True]
+    other = replace(squeeze, torque=torque / sliding)
+    assert is_jammed(HAND, 1.0, other, 0.02).tolist() == [False, False, True, True]

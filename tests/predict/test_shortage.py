@@ -160,7 +160,8 @@ def test_counts_of_a_shortage_add_up(jaws: Hand, tmp_path: Path) -> None:
     patterns = {"made": r"of (\d+) candidates", "found": r"only (\d+) of", "doubted": r"(\d+) hold with a probability",
                 "unsettled": r"The (\d+) that ranked lowest were not closed in simulation"}
     counts = {name: sum(map(int, re.findall(pattern, words))) for name, pattern in patterns.items()}
-    dropped = sum(int(count) for part in re.findall(r"\(dropped: (.*?)\)", words) for count in re.findall(r"\d+(?= [a-z])", part))
+    reasons = " ".join(re.findall(r"\(dropped: (.*?)\)", words))
+    dropped = sum(map(int, re.findall(r"\d+(?= [a-z])", reasons)))
     assert counts["made"] == counts["found"] + counts["doubted"] + counts["unsettled"] + dropped, words
     assert counts["unsettled"] > 0
 

@@ -60,7 +60,8 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
     Raises:
         ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
-    image, matrix = one_channel(numbers(depth, "the depth image")), numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
+    image = one_channel(numbers(depth, "the depth image"))
+    matrix = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64)
     if image.ndim != 2:
         raise ObjectError(f"the depth image has shape {image.shape}; expected (h, w), one depth a pixel")
     check_intrinsics(matrix, *image.shape)
