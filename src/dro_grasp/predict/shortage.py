@@ -194,11 +194,15 @@ def fingertip_range(hand: Hand) -> tuple[float, float]:
 
 
 def fingertip_forces(hand: Hand) -> float:
-    """Sum of the forces with which fingertips press, each as far as its weakest joint lets it [N]."""
+    """Sum of the forces with which fingertips press, each as far as its weakest joint lets it [N].
+
+    Fingers that one joint bends share its effort.
+    """
     tree, q = hand.tree, hand.canonical_joints(HALF)
     tips, poses = torch.tensor(hand.tips), tree.forward(q)
     points = se3.apply(poses[tips], hand.tip_offsets)
     lever = tree.point_jacobian(poses, points, tips).norm(dim=-2)
     bends = hand.movable & ~hand.abduction & (lever > LEAST_LEVER)
-    force = torch.where(bends, find_efforts(hand).limit / lever.clamp_min(LEAST_LEVER), torch.inf).amin(1)
+    share = find_efforts(hand).limit / bends.sum(0).clamp_min(1)
+    force = torch.where(bends, share / lever.clamp_min(LEAST_LEVER), torch.inf).amin(1)
     return float(force[force.isfinite()].sum())
