@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dro_grasp.cli.main import main
+from dro_grasp.hands.description.loader import read_state
 from dro_grasp.hands.library import BUILTIN_FOLDER
 
 
@@ -57,6 +58,24 @@ def test_what_cannot_be_written_is_refused_in_words(
     assert main(["hand", "vary", "gripper3", *options]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+SLIDER = """<robot name="jaws"><link name="base"/>
+<link name="left"/><joint name="slide" type="prismatic"><parent link="base"/><child link="left"/><axis xyz="0 1 0"/>
+<limit lower="0" upper="0.03" effort="25" velocity="1"/></joint>
+<link name="right"/><joint name="turn" type="revolute"><parent link="base"/><child link="right"/><axis xyz="0 1 0"/>
+<limit lower="0" upper="1" effort="2" velocity="1"/></joint></robot>"""
+
+
+def test_postures_beside_the_hand_come_along(tmp_path: Path) -> None:
+    (tmp_path / "jaws.urdf").write_text(SLIDER)
+    (tmp_path / "jaws.srdf").write_text('<robot name="jaws"><group_state name="open" group="hand"><joint name="slide" '
+                                        'value="0.02"/><joint name="turn" value="0.5"/></group_state></robot>')
+    output = tmp_path / "large.urdf"
+    assert main(["hand", "vary", str(tmp_path / "jaws.urdf"), "--scale", "1.5", "--mirrored", "--output", str(output)]) == 0
+    assert read_state(output.with_suffix(".srdf"), "open") == pytest.approx({"slide": 0.03, "turn": 0.5})
+    assert main(["hand", "vary", "gripper3", "--mirrored", "--output", str(tmp_path / "left.urdf")]) == 0
+    assert not (tmp_path / "left.srdf").exists()
 
 
 def test_the_hand_that_is_read_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

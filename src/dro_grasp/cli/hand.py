@@ -111,7 +111,7 @@ def _draw(files: list[Path], made: list[MadeHand], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Vary:
-    """Write the URDF of a hand's mirror image, or of a larger or smaller hand.
+    """Write the URDF of a hand's mirror image, or of a larger or smaller hand, and the SRDF of its postures if it has one.
 
     Example: dro-grasp hand vary leaphand --mirrored --scale 0.95 --output leap_left_small.urdf
     """
@@ -125,7 +125,7 @@ class Vary:
     def run(self) -> int:
         """Read, change, write."""
         from dro_grasp.hands.library import locate_hand
-        from dro_grasp.hands.variants import vary_hand
+        from dro_grasp.hands.variants import vary_hand, vary_postures
 
         if not self.mirrored and self.scale == 1:
             raise OptionError("nothing would change; give --mirrored, --scale, or both")
@@ -135,8 +135,10 @@ class Vary:
         if path.exists() and path.samefile(locate_hand(self.hand).path):
             raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")
         text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
-        with replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        for file, content in ((path.with_suffix(".srdf"), vary_postures(self.hand, factor=self.scale)), (path, text)):
+            if content is not None:
+                with replacing(file) as temporary:
+                    temporary.write_text(content, encoding="utf-8")
         if self.json:
             print_json({"hand": self.hand, "mirrored": self.mirrored, "scale": self.scale, "output": str(self.output)})
         else:

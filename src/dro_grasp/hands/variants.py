@@ -61,6 +61,30 @@ def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) 
     return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
+def vary_postures(name: str | Path, *, factor: float = 1.0) -> str | None:
+    """The SRDF of a variant, with the postures that the SRDF beside a hand's URDF states; None where there is none.
+
+    Equal joint values are the mirrored posture; what slides grows with the hand.
+
+    Raises:
+        HandError: No such hand, or its files are no XML or hold no numbers.
+    """
+    path = locate_hand(name).path
+    if not (srdf := path.with_suffix(".srdf")).is_file():
+        return None
+    slides = {joint.get("name") for joint in parse_xml(path).findall("joint") if _slides(joint)}
+    root = parse_xml(srdf)
+    for joint in (joint for state in root.iter("group_state") for joint in state.iter("joint")):
+        if joint.get("name") in slides:
+            try:
+                _change(joint, "value", (factor,))
+            except ValueError as error:
+                raise HandError(f"{srdf}: joint '{joint.get('name')}' has value=\"{joint.get('value')}\"; expected one number"
+                                ) from error
+    ET.indent(root)
+    return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'
+
+
 def mirror(root: ET.Element) -> None:
     """Turn a hand, in place, into its mirror image at the plane y = 0 of its root link: a right hand into a left one."""
     # Every link's frame is mirrored alike, so equal joint values give mirrored poses. Meshes get a negative scale along y,
