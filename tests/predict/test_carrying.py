@@ -164,12 +164,15 @@ def test_the_time_for_weighing_is_told(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("call", ["run", "run_many", "rounds"])
-@pytest.mark.parametrize(("hand", "refined", "why"), [
-    (HAND, False, "with refine=False none does"), (dataclasses.replace(HAND, description=None), True, "no description")])
+@pytest.mark.parametrize(("hand", "refined", "settle", "why"), [
+    (HAND, False, SettleConfig(), "with refine=False none does"),
+    (dataclasses.replace(HAND, description=None), True, SettleConfig(), "no description"),
+    (HAND, True, None, "this configuration leaves it out")])
 def test_limits_of_forces_are_refused_where_nothing_settles(
-    call: str, hand: dro.Hand, refined: bool, why: str, tmp_path: Path
+    call: str, hand: dro.Hand, refined: bool, settle: SettleConfig | None, why: str, tmp_path: Path
 ) -> None:
-    predictor, request = dro.GraspPredictor(untrained_weights(tmp_path)), GraspRequest(1, refine=refined)
+    config = PredictorConfig(finish=finish.FinishConfig(settle=settle))
+    predictor, request = dro.GraspPredictor(untrained_weights(tmp_path), config=config), GraspRequest(1, refine=refined)
     problem = GraspProblem(hand, CAN, constraints=Constraints(max_force=2.0, margin=2.0))
     calls = {"run": lambda: predictor.run(problem, request), "run_many": lambda: predictor.run_many([problem], request),
              "rounds": lambda: next(predictor.rounds(problem, request))}

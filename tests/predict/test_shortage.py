@@ -68,7 +68,8 @@ def test_jaws_press_with_the_effort_of_their_joints(jaws: Hand) -> None:
 
 def test_jaws_on_one_joint_share_its_effort(tmp_path: Path) -> None:
     """A servo that moves two jaws as far as itself does the work of both."""
-    left, right = (FINGER.format(name=name, y=0.015 * side, axis=side, effort=25) for name, side in (("left", 1), ("right", -1)))
+    left, right = (FINGER.format(name=name, y=0.015 * side, axis=side, effort=25)
+                   for name, side in (("left", 1), ("right", -1)))
     follows = right.replace("</joint>", '<mimic joint="left_slides"/></joint>')
     (tmp_path / "coupled.urdf").write_text(JAWS.format(fingers=left + follows))
     hand = load_hand(tmp_path / "coupled.urdf")

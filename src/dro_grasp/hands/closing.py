@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -154,12 +155,18 @@ def find_fixed_jaw(before: Points, points: Points, on_palm: Mask, on_finger: Mas
 
 def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     """The part of the palm that a hand's single finger closes on; None of several fingers."""
-    if len(hand.fingers) != 1:
+    palm, finger = ((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0))
+    return _single_jaw(hand.fingers, lambda share: hand.points(hand.canonical_joints(1 - share)).numpy(), palm, finger)
+
+
+def _single_jaw(
+    fingers: Sequence[Finger], points: Callable[[float], Points], on_palm: Mask, on_finger: Mask
+) -> FixedJaw | None:
+    """The jaw of points where the hand is closed by a share, of a hand with one finger; None of several fingers."""
+    if len(fingers) != 1:
         return None
-    parts = [(hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)]
-    for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in hand.fingers)]:
-        before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in shares)
-        if (jaw := find_fixed_jaw(before, after, *parts)) is not None:
+    for shares in NEARLY_CLOSED[: 1 + (len(fingers[0].chain) > 1)]:
+        if (jaw := find_fixed_jaw(*map(points, shares), on_palm, on_finger)) is not None:
             return jaw
     return None
 
@@ -521,14 +528,9 @@ class ClosingFinder:
 
     def fixed_jaw(self, opened: Joints, signs: Joints, abduction: JointMask) -> FixedJaw | None:
         """The part of the palm that a single finger closes on; None for several fingers."""
-        if len(self.fingers) != 1:
-            return None
-        for shares in NEARLY_CLOSED[: 1 + any(len(finger.chain) > 1 for finger in self.fingers)]:
-            postures = (self.posture(opened, signs, abduction, share) for share in shares)
-            before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
-            if (jaw := find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])) is not None:
-                return jaw
-        return None
+        return None if len(self.fingers) != 1 else _single_jaw(
+            self.fingers, lambda share: self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share))[0],
+            self.on_palm, self.on_fingers[0])
 
     def opened(self, signs: Joints) -> Joints:
         """The stated open posture; for other joints the limits towards which they open."""

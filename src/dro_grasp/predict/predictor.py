@@ -274,8 +274,8 @@ class GraspPredictor:
         """Refuse limits of forces where no hand settles, which alone tells forces: OptionError."""
         stated = [name for name in ("margin", "max_force") if getattr(problem.constraints, name) is not None]
         if stated and not (request.refine and self.config.finish.settle is not None and can_settle(problem)):
-            why = ("its hand has no description to simulate" if request.refine and not can_settle(problem) else
-                   "with refine=False none does")
+            why = ("with refine=False none does" if not request.refine else
+                   "its hand has no description to simulate" if not can_settle(problem) else "this configuration leaves it out")
             says = "say" if stated[1:] else "says"
             raise OptionError(f"{' and '.join(stated)} {says} how hands squeeze once they settle, and {why}; leave out one of "
                               "them")

@@ -62,10 +62,10 @@ def load_score_network(path: Path) -> ScoreNetwork:
     trained = next((entry.get(FEATURES_KEY) for entry in reversed(history_of(path))), None)
     if trained != feature_names():
         raise WeightsError(f"{path} states the features {trained}; this version computes {feature_names()}; train "
-                           "the network again (`python -m lab.recipe.ranking`)")
+                           "the network again (`python -m lab.recipe.ranking --folder out`)")
     return load_small(
         path, lambda tensors: ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"])),
-        "a ranking network; train it again (`python -m lab.recipe.ranking`)")
+        "a ranking network; train it again (`python -m lab.recipe.ranking --folder out`)")
 
 
 @cache
