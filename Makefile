@@ -1,10 +1,10 @@
-# make setup | demo | demo-arm | test | test-slow | test-full | data | labels | weights | rehearse | results | results-stale | tables | release-check | lint | docs | clean
+# make setup | demo | demo-arm | test | test-slow | test-full | data | labels | weights | rehearse | results | results-stale | results-confirm | tables | release-check | lint | docs | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow test-full results results-stale tables golden lint wheels release-check licences docs rehearse rehearse-bare docs-pictures data labels weights clean
+.PHONY: setup demo demo-arm test test-slow test-full results results-stale results-confirm tables golden lint wheels release-check licences docs rehearse rehearse-bare docs-pictures data labels weights clean
 
 setup: $(STAMP)
 
@@ -41,6 +41,9 @@ results: setup  # measure what is missing or older than its code (NAMES="headlin
 
 results-stale: setup  # what is missing or older than the code that it measures
 	$(BIN)/python -m lab.runner --stale $(NAMES)
+
+results-confirm: setup  # whether what is older than its code would come out the same: one command of each is run again
+	$(BIN)/python -m lab.confirm $(NAMES)
 
 tables: setup  # write tables, numbers and figures of README and docs from lab/results
 	$(BIN)/python -m lab.tables

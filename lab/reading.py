@@ -16,7 +16,7 @@ from typing import Any
 from dro_grasp.compare.metrics import success_rate
 from dro_grasp.compare.rows import ALL, Row, average
 from lab.measurements import MEASUREMENTS, PAPER_HANDS, SEEN_IN_PART
-from lab.runner import RESULTS
+from lab.runner import RESULTS, code_of
 from lab.studies import payload
 
 Cell = dict[str, Any]
@@ -130,7 +130,7 @@ def mixed(used: dict[str, Cell]) -> list[str]:
     found = ["weights"] if len({json.dumps(cell["weights"], sort_keys=True) for cell in used.values()}) > 1 else []
     states: dict[str, set[str]] = {}
     for cell in used.values():
-        for name, digest in cell["code"].items():  # measurements rest on different parts
+        for name, digest in code_of(cell).items():  # measurements rest on different parts
             states.setdefault(name, set()).add(digest)
     return found + [f"code of {name}" for name, digests in states.items() if len(digests) > 1]
 

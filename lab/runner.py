@@ -101,8 +101,13 @@ def reason(job: Job) -> str:
         return "missing"
     if kept["command"] != job.command:
         return "another command"
-    parts = [part for what in ("code", "weights") for part in differing(kept[what], job.state[what])]
+    parts = [*differing(code_of(kept), job.state["code"]), *differing(kept["weights"], job.state["weights"])]
     return f"changed since: {', '.join(parts)}" if parts else ""
+
+
+def code_of(cell: Mapping[str, Any]) -> dict[str, str]:
+    """Hashes of the code that a result is of: by its measurement, or by a later confirmation (`lab.confirm`)."""
+    return cell.get("confirmed", cell)["code"]
 
 
 def differing(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
