@@ -42,7 +42,7 @@ results: setup  # measure what is missing or older than its code (NAMES="headlin
 results-stale: setup  # what is missing or older than the code that it measures
 	$(BIN)/python -m lab.runner --stale $(NAMES)
 
-results-confirm: setup  # whether what is older than its code would come out the same: one command of each is run again
+results-confirm: setup  # whether what is older than its code would come out the same: one command of each is run with both
 	$(BIN)/python -m lab.confirm $(NAMES)
 
 tables: setup  # write tables, numbers and figures of README and docs from lab/results

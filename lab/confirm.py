@@ -1,9 +1,10 @@
-"""Whether results of earlier code are those of the present code: one command of each measurement is run again.
+"""Whether results of earlier code are those of the present code: one command of each measurement is run with both.
 
     python -m lab.confirm [NAME ...] [--workers 2]
 
-A change of code makes results stale, whether it changes any or not. Here the quickest command of a measurement is run again. If
-all its numbers but times come out the same, the measurement's results count as those of the present code, too, and each keeps
+A change of code makes results stale, whether it changes any or not. Here the quickest command of a measurement is run twice on
+one machine: at the commit of its result, and now. (Its numbers themselves may differ between machines, which round otherwise.)
+If all numbers but times come out the same, the measurement's results count as those of the present code, too, and each keeps
 where it was measured and where that was confirmed. If any differs, all stay stale. Times are never confirmed, nor are results
 of other commands or weights.
 """
@@ -11,16 +12,24 @@ of other commands or weights.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import datetime
+import json
 import math
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
-from lab.measurements import MEASUREMENTS
-from lab.runner import Job, at_hand, code_of, differing, jobs_of, keep, measure, prepare, read, uncommitted
+from dro_grasp.provenance import commit
+from lab.benchmarks.report import ROOT
+from lab.measurements import MEASUREMENTS, PREPARED
+from lab.reading import mixed
+from lab.runner import Job, at_hand, code_of, differing, git, jobs_of, keep, prepare, read, uncommitted, words
 
 TIMES = ("second", "[s]", "[ms]", "time", "hour", "speed", "cpu")
 """What names of times and speeds contain, in small letters."""
@@ -49,36 +58,61 @@ def main(argv: list[str] | None = None) -> int:
 def confirmable(name: str) -> list[Job]:
     """The commands of a measurement whose results differ from the present state by their code alone; none if any is fresh."""
     measurement, cells = MEASUREMENTS[name], read(name)["cells"]
-    if measurement.alone or not at_hand(measurement):
+    if measurement.alone or not at_hand(measurement) or not commit():
         return []
     jobs = [job for job in jobs_of(name, measurement) if job.cell in cells]
     kept = [cells[job.cell] for job in jobs]
     stale = [bool(differing(code_of(cell), job.state["code"])) for cell, job in zip(kept, jobs, strict=True)]
     same = all(cell["command"] == job.command and cell["weights"] == job.state["weights"]
                for cell, job in zip(kept, jobs, strict=True))
-    one = all(len({code_of(cell)[part] for cell in kept if part in code_of(cell)}) == 1
-              for part in {part for cell in kept for part in code_of(cell)})
-    return jobs if kept and all(stale) and same and one else []
+    one = not mixed({job.cell: cell for job, cell in zip(jobs, kept, strict=True)})
+    known = all(cell["commit"] != "unknown" for cell in kept)
+    return jobs if kept and all(stale) and same and one and known else []
 
 
 def confirmed(name: str, jobs: list[Job], beside: bool) -> bool:
-    """Run the quickest command again, and say and keep what came of it."""
-    cells = read(name)["cells"]
+    """Run the quickest command with both states of the code, and say and keep what came of it."""
+    cells, now = read(name)["cells"], commit().removesuffix("+")
     quickest = min(jobs, key=lambda job: cells[job.cell]["seconds"])
+    before = cells[quickest.cell]["commit"]
     try:
-        again = measure(quickest, beside)
+        with checkout(before) as folder:
+            old = printed(quickest.command, folder, beside)
+        new = printed(quickest.command, ROOT, beside)
     except (subprocess.CalledProcessError, ValueError, IndexError) as error:
         print(f"{name}: {quickest.cell} failed: {getattr(error, 'stderr', '') or error}", flush=True)
         return False
-    other = differences(cells[quickest.cell]["result"], again["result"])
-    if other:
-        print(f"{name}: {quickest.cell} came out otherwise: {', '.join(other[:3])}", flush=True)
+    if other := differences(old, new):
+        print(f"{name}: {quickest.cell} comes out otherwise than at {before}: {', '.join(other[:3])}", flush=True)
         return False
     for job in jobs:
         keep(job, cells[job.cell] | {"confirmed": {
-            "by": quickest.cell, "commit": again["commit"], "date": again["date"], "code": job.state["code"]}})
-    print(f"{name}: {quickest.cell} came out the same; all {len(jobs)} results count as the present code's", flush=True)
+            "by": quickest.cell, "commit": now, "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
+            "code": job.state["code"]}})
+    print(f"{name}: {quickest.cell} comes out the same as at {before}; all {len(jobs)} results count as the present code's",
+          flush=True)
     return True
+
+
+@contextlib.contextmanager
+def checkout(state: str) -> Iterator[Path]:
+    """The files of a commit in a folder of their own, with the prepared inputs of the present one."""
+    with tempfile.TemporaryDirectory() as holder:
+        folder = Path(holder) / "checkout"
+        git("worktree", "add", "--detach", str(folder), state)
+        try:
+            (folder / PREPARED).parent.mkdir(exist_ok=True)
+            (folder / PREPARED).symlink_to(ROOT / PREPARED)
+            yield folder
+        finally:
+            git("worktree", "remove", "--force", str(folder))
+
+
+def printed(command: str, folder: Path, beside: bool) -> Any:
+    """What a command prints in a checkout; with another beside it, each has one thread."""
+    environment = {**os.environ, "PYTHONPATH": str(folder / "src"), **({"OMP_NUM_THREADS": "1"} if beside else {})}
+    done = subprocess.run(words(command), cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def differences(old: Any, new: Any, where: str = "result") -> list[str]:

@@ -273,7 +273,7 @@ def state(results: Results) -> str:
     digest = next(v for k, v in weights.items() if "/" not in k)
     confirmed = cells[0].get("confirmed")
     again = "" if confirmed is None else (
-        f" Run again at commit `{confirmed['commit']}`, its command *{confirmed['by']}* gave the same numbers.")
+        f" Its command *{confirmed['by']}* gives the same numbers at commit `{confirmed['commit']}`.")
     return (f"The headline is of commit `{cells[0]['commit']}`, weights `{digest}`, {cells[0]['date']}, on {where['cores']} "
             f"cores of an {where['cpu']}, Python {where['python']}, PyTorch {where['torch'].partition('+')[0]}, "
             f"MuJoCo {where['mujoco']}.{again}")
