@@ -14,7 +14,7 @@ from dro_grasp.compare.methods import Method
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.compare.rows import EvaluatedGrasps, Row, average, hand_row
 from dro_grasp.compare.stages import BEST, EQUAL_TIME, RANKED, RAW, REFINED, RETURNED, STAGES, BenchmarkConfig, benchmark
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import PROVENANCE, SynthesisConfig, synthesize
@@ -116,6 +116,17 @@ def test_a_stored_grasp_is_returned_once(tmp_path: Path, predictor: GraspPredict
     StartSource().propose(GraspProblem(HAND, CAN), 5, 0).save(tmp_path / "few.parquet")
     row = measured(FileSource(tmp_path / "few.parquet"), predictor, RETURNED, num=32)[RETURNED]
     assert (row.asked, row.returned, row.candidates) == (5, 5, 5)
+
+
+def test_a_file_that_lacks_an_object_is_refused_before_anything_is_measured(
+    tmp_path: Path, predictor: GraspPredictor, good: GraspBatch
+) -> None:
+    good[:2].save(tmp_path / "cans.parquet")
+    methods, done = [Method(StartSource(), predictor), Method(FileSource(tmp_path / "cans.parquet"), predictor)], []
+    with pytest.raises(GraspFileError, match="'cans' holds no grasp of 'torus', but of can"):
+        benchmark([HAND], [CAN, load_object("torus")], methods, BenchmarkConfig(num=4, stages=(RAW,), protocols=(LENIENT,)),
+                  lambda *pairs: done.append(pairs))
+    assert not done
 
 
 def test_the_optimisers_share_counts_grasps_of_every_version(tmp_path: Path, predictor: GraspPredictor) -> None:

@@ -83,6 +83,7 @@ def benchmark(
 
     Raises:
         OptionError: Two methods have one name, or a method returns more grasps than it was asked for.
+        GraspFileError: A grasp file lacks grasps of an object; this is known before anything is measured.
     """
     names = [method.name for method in methods]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -90,6 +91,9 @@ def benchmark(
     table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
     done, pairs = 0, len(hands) * len(objects)
     objects = [obj if config.mass is None else with_mass(obj, config.mass) for obj in objects]
+    for method in (method for method in methods if any(map(method.knows, hands))):
+        for obj in objects:
+            method.asked(obj, config.num)
     for hand in hands:
         found: dict[tuple[str, str], list[EvaluatedGrasps]] = {}
         for obj in objects:
