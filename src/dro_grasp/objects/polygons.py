@@ -13,8 +13,9 @@ from dro_grasp.geometry.mesh_files import trimesh
 
 FOLD = 2e-3  # Angle up to which two faces lie on one another [rad] (ours): coordinates of files are rounded
 FLAT = 1e-4  # Distance from a plane up to which a vertex lies in it, over the mesh's largest extent [1] (ours)
-MOST = 1000  # Folds that are looked at (ours): of more, which a damaged scan may have, each search would take time for nothing
+MOST = 64  # Folds that are of no polygon before no more are looked at (ours): crumpled scans have thousands
 LEAST = 1e-3  # Area that is folded, over that of the mesh, from which on it is cut anew [1] (ours): scans have small folds
+BESIDE = 32  # Most faces around some without area that are compared with each other (ours)
 EXACT = 1e-3  # Share of an outline's area by which the area of the faces within it may differ [1] (ours)
 
 Faces = Int[np.ndarray, "n 3"]
@@ -34,8 +35,10 @@ def unfold(mesh: trimesh.Trimesh) -> int:
     if not len(folded):
         return 0
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
-    dropped, added, count = np.zeros(len(faces), bool), list[Faces](), 0
-    for pair in folded[:MOST]:
+    dropped, added, count, others = np.zeros(len(faces), bool), list[Faces](), 0, 0
+    for pair in folded:
+        if others == MOST:
+            break
         if dropped[pair].any():
             continue
         larger = pair[size[pair].argmax()]
@@ -50,6 +53,8 @@ def unfold(mesh: trimesh.Trimesh) -> int:
         if size[group].sum() - area > LEAST * size.sum() and abs(_size(vertices[within]) - area) < EXACT * area:
             dropped[group], count = True, count + 1
             added.append(within)
+        else:
+            others += 1
     if count:
         mesh.faces = np.concatenate([faces[~dropped], *added])
         mesh.remove_unreferenced_vertices()
@@ -67,7 +72,7 @@ def _folded_pairs(mesh: trimesh.Trimesh, normals: Float[np.ndarray, "m 3"]) -> I
         around: dict[int, list[int]] = {}
         for piece, face in sorted(beside):
             around.setdefault(piece, []).append(face)
-        further = [pair for faces in around.values() for pair in combinations(faces, 2)]
+        further = [pair for faces in around.values() if len(faces) <= BESIDE for pair in combinations(faces, 2)]
         pairs = np.concatenate([pairs[~empty[pairs].any(1)], np.array(further, int).reshape(-1, 2)])
     return pairs[np.einsum("ni,ni->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) < -np.cos(FOLD)]
 
@@ -119,12 +124,13 @@ def _within(vertices: Float[np.ndarray, "n 3"], outlines: Sequence[Loop]) -> Fac
     """Triangles within outlines, seen along the normal of what they enclose, from where they lead counter-clockwise."""
     import manifold3d
 
-    normal = sum(np.cross(vertices[loop], np.roll(vertices[loop], -1, axis=0)).sum(0) for loop in outlines)
-    if not (length := np.linalg.norm(normal)):
+    normal = np.sum([np.cross(vertices[loop], np.roll(vertices[loop], -1, axis=0)).sum(0) for loop in outlines], axis=0)
+    length = float(np.linalg.norm(normal))
+    if length == 0:
         return np.zeros((0, 3), int)
     # Two directions across the normal, which with it are right-handed.
     across = np.linalg.svd(np.atleast_2d(normal / length))[2][1:]
-    across[1] *= np.sign(np.linalg.det([*across, normal]))
+    across[1] *= np.sign(np.linalg.det(np.stack([*across, normal / length])))
     flat = [np.ascontiguousarray(vertices[loop] @ across.T) for loop in outlines]
     order = np.concatenate([np.asarray(loop) for loop in outlines])
     return order[np.asarray(manifold3d.triangulate(flat, allow_convex=False))]
