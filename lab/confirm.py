@@ -123,8 +123,10 @@ def differences(old: Any, new: Any, where: str = "result") -> list[str]:
             differences(old[name], new[name], f"{where}.{name}") if name in old and name in new else [f"{where}.{name}"])]
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         return [text for i, pair in enumerate(zip(old, new, strict=True)) for text in differences(*pair, f"{where}[{i}]")]
-    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (old, new))
-    same = math.isclose(old, new, rel_tol=ROUNDING, abs_tol=0.0) if numbers else old == new
+    if isinstance(old, int | float) and isinstance(new, int | float):
+        same = math.isclose(old, new, rel_tol=ROUNDING, abs_tol=0.0) and isinstance(old, bool) == isinstance(new, bool)
+    else:
+        same = old == new
     return [] if same else [f"{where} {old!r} -> {new!r}"]
 
 

@@ -63,7 +63,7 @@ def require_seed(seed: int, bits: int = 63) -> None:
         raise OptionError(f"seed is {seed}; give an integer from 0 to 2^{bits} - 1")
 
 
-def is_number(value: object) -> bool:
+def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and no truth value."""
     return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 

@@ -166,7 +166,8 @@ def _single_jaw(
     if len(fingers) != 1:
         return None
     for shares in NEARLY_CLOSED[: 1 + (len(fingers[0].chain) > 1)]:
-        if (jaw := find_fixed_jaw(*map(points, shares), on_palm, on_finger)) is not None:
+        before, after = map(points, shares)
+        if (jaw := find_fixed_jaw(before, after, on_palm, on_finger)) is not None:
             return jaw
     return None
 
