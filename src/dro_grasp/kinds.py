@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import math
 import operator
 import sys
 from collections.abc import Callable
@@ -65,7 +66,8 @@ def require_seed(seed: int, bits: int = 63) -> None:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and no truth value."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    size: Any = abs(value) if isinstance(value, Real) and not isinstance(value, bool) else math.inf
+    return size <= sys.float_info.max
 
 
 def plain(name: str, given: Any, kind: Any) -> Any:
