@@ -7,7 +7,6 @@ import functools
 import inspect
 import math
 import operator
-import sys
 from collections.abc import Callable
 from numbers import Real
 from types import NoneType, SimpleNamespace, UnionType
@@ -66,8 +65,10 @@ def require_seed(seed: int, bits: int = 63) -> None:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and no truth value."""
-    size: Any = abs(value) if isinstance(value, Real) and not isinstance(value, bool) else math.inf
-    return size <= sys.float_info.max
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer beyond the largest float
+        return False
 
 
 def plain(name: str, given: Any, kind: Any) -> Any:
