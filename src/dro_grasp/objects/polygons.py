@@ -120,7 +120,7 @@ def _loops(edges: Int[np.ndarray, "m 2"]) -> tuple[list[Loop], bool]:
     return found, whole
 
 
-def _within(vertices: Float[np.ndarray, "n 3"], outlines: Sequence[Loop]) -> Faces:
+def _within(vertices: Float[np.ndarray, "m 3"], outlines: Sequence[Loop]) -> Faces:
     """Triangles within outlines, seen along the normal of what they enclose, from where they lead counter-clockwise."""
     import manifold3d
 

@@ -94,6 +94,7 @@ def test_a_mask_that_a_jpeg_blurs_is_its_brighter_half(tmp_path: Path) -> None:
         assert (np.array(blurred) != 0).sum() > mask.sum(), "it is blurred"
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 @pytest.mark.parametrize(("given", "told"), [
     ({"T_frame_camera": "camera"}, "T_frame_camera"), ({"T_frame_camera": [[1, 0], [0]]}, "T_frame_camera"),
     ({"depth_unit": "0.001"}, "depth_unit is '0.001'"), ({"depth_unit": True}, "depth_unit is True"),
@@ -103,6 +104,7 @@ def test_cameras_of_something_else_are_refused_in_words(given: dict[str, Any], t
         SceneCamera(**({"T_frame_camera": np.eye(4)} | given))
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_a_last_row_that_products_of_matrices_leave_is_a_motions(tmp_path: Path) -> None:
     T = np.eye(4)
     T[3] = (1e-9, -2e-8, 0, 1 + 1e-9)

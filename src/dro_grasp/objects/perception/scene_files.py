@@ -91,7 +91,7 @@ def _array(path: Path) -> Num[np.ndarray, "..."]:
     return np.load(path, allow_pickle=False)
 
 
-def read_depth(path: Path, camera: SceneCamera | None) -> Num[np.ndarray, "h w"]:
+def read_depth(path: Path, camera: SceneCamera | None) -> Num[np.ndarray, "h w *channel"]:
     """Depths of a file, in its unit."""
     if path.suffix.lower() == ".npy":
         return _array(path)
