@@ -29,13 +29,13 @@ FLAT_HANDS = ("assets/leaphand", "assets/shadowhand", "gripper3")
 OBJECTS = {"validate": "assets:validate", "test": "builtin:test"}
 """Objects that no weights were trained on: the paper's, by which the form of the network was once chosen, and built-in ones."""
 HARD = "builtin:hard_test"
-"""Thin, flat, hollow, small, large and heavy ones, by which nothing was chosen."""
+"""Thin, flat, hollow, small, large and heavy ones, on which no setting was chosen."""
 MADE_HANDS = 10
 """Procedural hands, with seeds that no training used."""
 HALF = GraspRequest.candidates // 2
 """Half of the candidates that `generate` makes at most for each grasp."""
 FLAT_THINGS = ("ballpoint_pen", "bank_card", "dinner_plate", "table_fork", "hardcover_book", "scissors")
-"""Flat and thin things, by which nothing was chosen."""
+"""Flat and thin things, on which no setting was chosen."""
 ROBOTS = ("xarm7_leaphand", "ur5e_allegro")
 """Built-in arms with hands."""
 ROBOT_HANDS = ("leaphand", "allegro")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class Synthesize:
     """Synthesize grasps from geometry alone, and keep those that pass a trial. A rerun resumes.
 
-    Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output data
+    Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output my_data
     """
 
     hand: tuple[str, ...]  # Names or paths of hands.
@@ -220,7 +220,7 @@ class DataSets:
 class Report(DataSets):
     """Report yields, failures and diversity of a data set: palm directions, wrist rolls, grasp sizes, joints.
 
-    Example: dro-grasp dataset report data --output report.html
+    Example: dro-grasp dataset report my_data --output report.html
     """
 
     output: Annotated[Path | None, optional("PATH", "no page")] = None  # Self-contained HTML page with charts and pictures.
@@ -251,7 +251,7 @@ class Report(DataSets):
 class Merge(DataSets):
     """Merge data sets into one file per hand, or several of about 100 MB, without near-duplicates and failed grasps.
 
-    Example: dro-grasp dataset merge data more --output grasps --per-pair 150
+    Example: dro-grasp dataset merge my_data more --output grasps --per-pair 150
     """
 
     output: Path  # Folder for the files; created if missing. It holds temporary files, as large as the inputs, until the end.
@@ -298,7 +298,7 @@ class Merge(DataSets):
 class Check(DataSets):
     """Evaluate a random sample of a data set again, and compare the results with the stored ones.
 
-    Example: dro-grasp dataset check data --sample 500
+    Example: dro-grasp dataset check my_data --sample 500
     """
 
     sample: int = 100  # Grasps to evaluate, drawn uniformly from all grasps.
@@ -381,7 +381,7 @@ class Filter(DataSets):
 class BundleCommand(DataSets):
     """Pack grasps, hands and object clouds into one portable file for training.
 
-    Example: dro-grasp dataset bundle data --output bundle.safetensors
+    Example: dro-grasp dataset bundle my_data --output bundle.safetensors
     """
 
     output: Path  # Bundle to write (.safetensors).
